@@ -1,0 +1,79 @@
+//! One RGB-D frame as the estimator sees it: depth registered to colour, one ideal pinhole camera.
+
+use crate::{DepthNoise, Image};
+use coma_geometry::{Intrinsics, StampNs};
+
+/// A frame. Depth is metres along z in the colour camera; 0 means no measurement.
+#[derive(Clone, Debug)]
+pub struct RgbdFrame {
+    /// Position in its session's stream.
+    pub sequence: u64,
+    /// Sensor clock.
+    pub stamp: StampNs,
+    /// The camera of both images.
+    pub camera: Intrinsics,
+    /// How wrong the depth is.
+    pub noise: DepthNoise,
+    /// sRGB, `[height, width]`.
+    pub color: Image<[u8; 3]>,
+    /// Metres, `[height, width]`; 0 = no measurement; never NaN or negative.
+    pub depth_m: Image<f32>,
+}
+
+/// Why images do not make a frame; names the field.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum FrameError {
+    /// An image's size is not the camera's.
+    #[error("{field} is {width}x{height}, but the camera is {camera_width}x{camera_height}")]
+    Size {
+        /// `color` or `depth`.
+        field: &'static str,
+        /// Found.
+        width: usize,
+        /// Found.
+        height: usize,
+        /// Stated by the calibration.
+        camera_width: u32,
+        /// Stated by the calibration.
+        camera_height: u32,
+    },
+}
+
+impl RgbdFrame {
+    /// Checks sizes and replaces depth that is NaN, infinite or negative by 0.
+    pub fn new(
+        sequence: u64,
+        stamp: StampNs,
+        camera: Intrinsics,
+        noise: DepthNoise,
+        color: Image<[u8; 3]>,
+        mut depth_m: Image<f32>,
+    ) -> Result<Self, FrameError> {
+        let size = |field, width, height| {
+            if width == camera.width as usize && height == camera.height as usize {
+                return Ok(());
+            }
+            Err(FrameError::Size {
+                field,
+                width,
+                height,
+                camera_width: camera.width,
+                camera_height: camera.height,
+            })
+        };
+        size("color", color.width(), color.height())?;
+        size("depth", depth_m.width(), depth_m.height())?;
+        for z in depth_m.pixels_mut() {
+            if !(z.is_finite() && *z > 0.0) {
+                *z = 0.0;
+            }
+        }
+        Ok(RgbdFrame { sequence, stamp, camera, noise, color, depth_m })
+    }
+
+    /// Share of pixels with a depth measurement, 0..1.
+    pub fn depth_coverage(&self) -> f32 {
+        let measured = self.depth_m.pixels().iter().filter(|z| **z > 0.0).count();
+        measured as f32 / self.depth_m.pixels().len() as f32
+    }
+}

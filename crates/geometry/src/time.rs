@@ -1,0 +1,20 @@
+//! Sensor time.
+
+use serde::{Deserialize, Serialize};
+
+/// A sensor clock's reading in nanoseconds. Stamps order the frames of one session, are written back
+/// unchanged, and are never compared between agents.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub struct StampNs(pub i64);
+
+impl StampNs {
+    /// Seconds, for plots and TUM files. Exact digits need the input's own text.
+    pub fn seconds(self) -> f64 {
+        self.0 as f64 * 1e-9
+    }
+
+    /// Nearest stamp to `seconds`.
+    pub fn from_seconds(seconds: f64) -> Self {
+        StampNs((seconds * 1e9).round() as i64)
+    }
+}

@@ -1,0 +1,109 @@
+//! Surfels as values and as columns.
+
+use nalgebra::{Matrix3, Quaternion, UnitQuaternion};
+
+/// One surfel: a disc with centre, two tangent axes and a normal (the columns of its rotation), in the
+/// frame of its submap. Eq. 6 to 8 of the CoMA-SLAM paper say how one is made from a pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Surfel {
+    /// Centre, metres.
+    pub center_m: [f32; 3],
+    /// Rotation of the disc `(e1, e2, normal)` in its submap, a unit quaternion `w, x, y, z`.
+    pub rotation_wxyz: [f32; 4],
+    /// Standard deviations along `e1` and `e2`, metres.
+    pub scale_m: [f32; 2],
+    /// 0..1.
+    pub opacity: f32,
+    /// RGB, 0..1.
+    pub color: [f32; 3],
+}
+
+/// Surfels as columns (structure of arrays); every column has the same length.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct SurfelCloud {
+    /// Centres, metres. `[n, 3]`
+    pub center_m: Vec<[f32; 3]>,
+    /// Unit quaternions w, x, y, z. `[n, 4]`
+    pub rotation_wxyz: Vec<[f32; 4]>,
+    /// Standard deviations along the two tangents, metres. `[n, 2]`
+    pub scale_m: Vec<[f32; 2]>,
+    /// 0..1. `[n]`
+    pub opacity: Vec<f32>,
+    /// RGB, 0..1. `[n, 3]`
+    pub color: Vec<[f32; 3]>,
+}
+
+impl SurfelCloud {
+    /// Number of surfels.
+    pub fn len(&self) -> usize {
+        self.center_m.len()
+    }
+
+    /// True without surfels.
+    pub fn is_empty(&self) -> bool {
+        self.center_m.is_empty()
+    }
+
+    /// Appends one.
+    pub fn push(&mut self, surfel: Surfel) {
+        self.center_m.push(surfel.center_m);
+        self.rotation_wxyz.push(surfel.rotation_wxyz);
+        self.scale_m.push(surfel.scale_m);
+        self.opacity.push(surfel.opacity);
+        self.color.push(surfel.color);
+    }
+
+    /// The surfel at `index`.
+    pub fn get(&self, index: usize) -> Surfel {
+        Surfel {
+            center_m: self.center_m[index],
+            rotation_wxyz: self.rotation_wxyz[index],
+            scale_m: self.scale_m[index],
+            opacity: self.opacity[index],
+            color: self.color[index],
+        }
+    }
+
+    /// All surfels, in order.
+    pub fn iter(&self) -> impl Iterator<Item = Surfel> + '_ {
+        (0..self.len()).map(|i| self.get(i))
+    }
+
+    /// Keeps the surfels for which `keep[i]` holds, in order.
+    ///
+    /// # Panics
+    /// If `keep` has another length.
+    pub fn retain(&mut self, keep: &[bool]) {
+        assert_eq!(keep.len(), self.len(), "one flag for each surfel");
+        fn column<T: Copy>(values: &mut Vec<T>, keep: &[bool]) {
+            let mut i = 0;
+            values.retain(|_| {
+                i += 1;
+                keep[i - 1]
+            });
+        }
+        column(&mut self.center_m, keep);
+        column(&mut self.rotation_wxyz, keep);
+        column(&mut self.scale_m, keep);
+        column(&mut self.opacity, keep);
+        column(&mut self.color, keep);
+    }
+}
+
+impl FromIterator<Surfel> for SurfelCloud {
+    fn from_iter<I: IntoIterator<Item = Surfel>>(surfels: I) -> Self {
+        let mut cloud = SurfelCloud::default();
+        for surfel in surfels {
+            cloud.push(surfel);
+        }
+        cloud
+    }
+}
+
+impl Surfel {
+    /// The rotation as a matrix with columns `e1, e2, normal`.
+    pub fn rotation(&self) -> Matrix3<f32> {
+        let [w, x, y, z] = self.rotation_wxyz;
+        *UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)).to_rotation_matrix().matrix()
+    }
+}

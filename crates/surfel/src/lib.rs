@@ -1,0 +1,7 @@
+//! 2D Gaussian surfels: flat, oriented discs with colour and opacity.
+
+pub mod cloud;
+pub mod pack;
+pub mod ply;
+
+pub use cloud::{Surfel, SurfelCloud};

@@ -1,0 +1,1 @@
+//! Packing to at most 24 bytes a surfel.
