@@ -212,7 +212,7 @@ fn linear12_step_m(near_m: f32, far_m: f32) -> f64 {
     (far_m as f64 - near_m as f64) / (LINEAR12_CODES - 1) as f64
 }
 
-/// Levels from `near_m` to at least `far_m`, each `2 fraction sigma` beyond the one before. Between two levels
+/// Levels from `near_m` to `far_m`, each at most `2 fraction sigma` beyond the one before. Between two levels
 /// sigma is at least that of the nearer one, so the nearest level is within `fraction sigma(z)` of any z.
 /// Sums and products in f64 only: the same numbers on every machine.
 fn noise_levels_m(
@@ -226,8 +226,8 @@ fn noise_levels_m(
     let mut levels_m = vec![near_m as f64];
     let mut z = near_m as f64;
     while z < far_m as f64 {
-        let next = z + step_at(z);
-        if !(next > z) || levels_m.len() == u16::MAX as usize {
+        let next = (z + step_at(z)).min(far_m as f64);
+        if next <= z || levels_m.len() == u16::MAX as usize {
             return Err(DepthCodecError::TooManyLevels {
                 step_m: step_at(near_m as f64),
                 near_m: near_m as f64,
