@@ -120,7 +120,7 @@ impl Manifest {
             require(!name.is_empty(), format!("{field} is empty"))?;
         }
         if let Pooling::Gem { power, .. } = output.pooling {
-            let right = power >= 1.0 && power <= 100.0;
+            let right = (1.0..=100.0).contains(&power);
             require(right, format!("output.pooling.power is {power}, expected 1 to 100"))?;
         }
         for (field, value) in [("theta_sim", thresholds.theta_sim), ("theta_multi", thresholds.theta_multi)] {
