@@ -170,7 +170,6 @@ fn two_stage(candidates: &[Candidate], robust: &RobustSettings) -> Option<(Pose,
 /// Graduated non-convexity over a model that is fitted in one step: `fit(weights)` gives the model,
 /// `squared(model)` the squared residuals.
 fn graduated<M>(
-    count: usize,
     robust: &RobustSettings,
     allowed: &[f64],
     fit: impl Fn(&[f64]) -> Option<M>,
@@ -183,17 +182,17 @@ fn graduated<M>(
         squared(model).iter().zip(allowed).map(|(r, a)| if *a > 0.0 { *r } else { 0.0 }).fold(0.0, f64::max)
     };
     if let Some(mut schedule) = Schedule::new(robust.kernel, limit, robust.convexity_step, worst(&model)) {
+        let reweighted = |model: &M, weight: &dyn Fn(f64) -> f64| -> Vec<f64> {
+            squared(model).iter().zip(allowed).map(|(r, a)| a * weight(*r)).collect()
+        };
         for _ in 0..robust.max_rounds {
-            let residuals = squared(&model);
-            let next: Vec<f64> = (0..count).map(|k| allowed[k] * schedule.weight(residuals[k])).collect();
-            let Some(refitted) = fit(&next) else { break };
-            (model, weights) = (refitted, next);
+            let Some(refitted) = fit(&reweighted(&model, &|r| schedule.weight(r))) else { break };
+            model = refitted;
             if !schedule.advance() {
                 break;
             }
         }
-        let residuals = squared(&model);
-        weights = (0..count).map(|k| allowed[k] * final_weight(robust.kernel, limit, residuals[k])).collect();
+        weights = reweighted(&model, &|r| final_weight(robust.kernel, limit, r));
         if let Some(refitted) = fit(&weights) {
             model = refitted;
         }
@@ -249,7 +248,7 @@ fn robust_rotation(
             })
             .collect()
     };
-    graduated(candidates.len(), robust, &vec![1.0; candidates.len()], fit, squared)
+    graduated(robust, &vec![1.0; candidates.len()], fit, squared)
 }
 
 fn robust_translation(
@@ -281,7 +280,7 @@ fn robust_translation(
     let squared = |t: &Vector3<f64>| {
         points.iter().map(|(offset, omega)| (offset - t).dot(&(omega * (offset - t)))).collect()
     };
-    graduated(points.len(), robust, allowed, fit, squared)
+    graduated(robust, allowed, fit, squared)
 }
 
 /// Size of the largest set of loops that are independent of each other, pair by pair.
