@@ -4,8 +4,10 @@
 //! The information is in the order x y z qx qy qz, taken as that of (translation, rotation vector), as
 //! GTSAM takes it, without a factor of 4. `FIX id` holds a vertex; `#` starts a comment.
 
+use crate::graph::{Edge, GraphEntries, UsableGraph};
+use crate::solution::Solution;
 use crate::solver::{Constraint, Problem};
-use coma_geometry::{Matrix6, Pose};
+use coma_geometry::{Matrix6, Pose, SubmapId};
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
@@ -276,6 +278,36 @@ impl G2oGraph {
             out.push('\n');
         }
         out
+    }
+
+    /// A solved graph: every submap of every component, odometry, and the loops that were used; gauges are fixed.
+    /// Vertex `k` is the `k`-th of the submaps returned beside it.
+    pub fn from_solution(solution: &Solution, entries: &GraphEntries) -> (Self, Vec<SubmapId>) {
+        let mut graph = G2oGraph::default();
+        let mut submaps = Vec::new();
+        let mut vertex: BTreeMap<&SubmapId, u64> = BTreeMap::new();
+        for component in &solution.components {
+            for (submap, pose) in &component.map_from_submap {
+                let id = submaps.len() as u64;
+                vertex.insert(submap, id);
+                graph.vertices.insert(id, *pose);
+                if *submap == component.gauge {
+                    graph.fixed.insert(id);
+                }
+                submaps.push(submap.clone());
+            }
+        }
+        let loops = solution.components.iter().flat_map(|c| &c.loops);
+        let used: BTreeSet<_> = loops.filter(|l| l.weight >= 0.5).map(|l| &l.key).collect();
+        let usable = UsableGraph::new(entries);
+        let kept = |e: &&Edge| used.contains(&e.key);
+        for e in usable.odometry.iter().chain(usable.loops.iter().filter(kept)) {
+            if let (Some(&from), Some(&to)) = (vertex.get(&e.from), vertex.get(&e.to)) {
+                let (from_from_to, information) = (e.from_from_to, e.information);
+                graph.edges.push(G2oEdge { from, to, from_from_to, information });
+            }
+        }
+        (graph, submaps)
     }
 
     /// The problem over vertices in ascending order of id, with the file's poses as the start. Without `FIX`

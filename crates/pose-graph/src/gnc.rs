@@ -124,6 +124,9 @@ pub enum Trust {
     Suspended,
 }
 
+/// Most rounds under the final cost; two or three settle it.
+const POLISH_ROUNDS: u32 = 10;
+
 /// A solution with the weights that it was reached with.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RobustSolved {
@@ -178,12 +181,20 @@ pub fn solve(
             }
         }
     }
-    // Under the robust cost itself, for all that may be doubted, until nothing changes.
+    // Under the robust cost itself, for all that may be doubted, until nothing changes. What was left out is judged by
+    // what taking it in would cost, not by the error that leaving it out has caused.
     let questioned: Vec<usize> = (0..trust.len()).filter(|&k| trust[k] != Trust::Full).collect();
-    for _ in 0..10 {
+    for _ in 0..POLISH_ROUNDS {
         let mut next = weights.clone();
+        let out: Vec<usize> = questioned.iter().copied().filter(|&k| !(weights[k] > 0.0)).collect();
         for &k in &questioned {
             next[k] = final_weight(robust.kernel, limit, squared(&solved.poses, k));
+        }
+        if !out.is_empty() {
+            let innovations = solver.innovations(&solved.poses, &weights, &out)?;
+            for (&k, innovation) in out.iter().zip(innovations) {
+                next[k] = next[k].max(final_weight(robust.kernel, limit, innovation));
+            }
         }
         let change = next.iter().zip(&weights).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         if !(change > 1e-3) || !connected(problem, &next) {

@@ -275,6 +275,48 @@ impl<'a> Solver<'a> {
         Ok(&mut self.system)
     }
 
+    /// Squared Mahalanobis errors of the constraints `asked` (of weight zero) against a solution that knows nothing of
+    /// them: `e^T (Omega^-1 + J Sigma J^T)^-1 e` with the solution's covariance Sigma. To first order this is by
+    /// how much twice the cost would rise if the constraint were taken in.
+    pub(crate) fn innovations(
+        &mut self,
+        poses: &[Pose],
+        weights: &[f64],
+        asked: &[usize],
+    ) -> Result<Vec<f64>, SolveError> {
+        let problem = self.problem;
+        let variable = self.variable.clone();
+        let system = self.factorise_at(poses, weights)?;
+        let n = system.blocks() * 6;
+        let mut columns = vec![0.0; n * 6];
+        Ok(asked
+            .iter()
+            .map(|&k| {
+                let c = &problem.constraints[k];
+                let at = linearise(&poses[c.from], &poses[c.to], &c.from_from_to);
+                let ends = [(variable[c.from], at.wrt_i), (variable[c.to], at.wrt_j)];
+                // Columns of Sigma J^T.
+                columns.fill(0.0);
+                for (v, jacobian) in &ends {
+                    let Some(v) = v else { continue };
+                    for (column, row) in jacobian.row_iter().enumerate() {
+                        for (axis, value) in row.iter().enumerate() {
+                            columns[column * n + v * 6 + axis] = *value;
+                        }
+                    }
+                }
+                system.solve_in_place(&mut columns, 6);
+                let mut spread = c.information.try_inverse().unwrap_or_else(Matrix6::zeros);
+                for (v, jacobian) in &ends {
+                    let Some(v) = v else { continue };
+                    spread += jacobian * Matrix6::from_fn(|row, column| columns[column * n + v * 6 + row]);
+                }
+                let spread = (spread + spread.transpose()) * 0.5;
+                spread.cholesky().map_or(f64::INFINITY, |factor| at.error.dot(&factor.solve(&at.error)))
+            })
+            .collect())
+    }
+
     /// The variable of a node; `None` for fixed ones.
     pub(crate) fn variable(&self, node: usize) -> Option<usize> {
         self.variable.get(node).copied().flatten()

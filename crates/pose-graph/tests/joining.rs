@@ -3,6 +3,7 @@
 mod world;
 
 use coma_geometry::{Epoch, Pose, se3};
+use coma_pose_graph::g2o::G2oGraph;
 use coma_pose_graph::graph::{EntryName, EntryProblem};
 use coma_pose_graph::relative::NotJoined;
 use coma_pose_graph::{EdgeKey, EdgeKind, GlobalSettings, LoopVerdict, MapId, solve};
@@ -255,4 +256,20 @@ fn of_two_verdicts_on_one_pair_the_smallest_key_counts() {
     world.entries.edges.push(twin);
     let solution = solve(&world.entries, &GlobalSettings::default());
     assert_eq!(solution.rejected, [(EntryName::Edge(first), EntryProblem::ConflictingKey)]);
+}
+
+#[test]
+fn a_solution_written_as_g2o_has_the_same_cost() {
+    let mut world = two_agents(13);
+    world.measured_loop(("a", 5), ("b", 3));
+    world.measured_loop(("a", 20), ("b", 16));
+    world.measured_loop(("a", 28), ("b", 27));
+    world.false_loop(("a", 1), ("b", 22));
+    let solution = solve(&world.entries, &GlobalSettings::default());
+    let (graph, submaps) = G2oGraph::from_solution(&solution, &world.entries);
+    assert_eq!((submaps.len(), graph.edges.len()), (60, 58 + 3));
+    let (problem, poses) = G2oGraph::parse(&graph.to_text()).unwrap().problem();
+    let wanted = solution.components[0].cost;
+    // Some odometry lies after the cut: it is composed and costs nothing.
+    assert!((problem.cost(&poses, &[1.0; 61]) - wanted).abs() < 1e-6 * wanted);
 }
