@@ -254,9 +254,16 @@ fn solve_component(
     let within = |e: &&Edge| start.contains_key(&e.from) && start.contains_key(&e.to);
     let loops: Vec<&Edge> = graph.loops.iter().filter(within).collect();
     let contradicting = contradicting(pairs, joins);
+    // A loop that nothing supports is left out until the others say where its ends are.
+    let supported = supported(pairs, joins);
     let trust: Vec<Trust> = loops
         .iter()
-        .map(|e| if contradicting.contains(&e.key) { Trust::Suspended } else { Trust::Doubted })
+        .map(|e| {
+            let within_a_chain = members
+                .iter()
+                .any(|&k| chains[k].submaps.contains(&e.from) && chains[k].submaps.contains(&e.to));
+            if within_a_chain || supported.contains(&e.key) { Trust::Doubted } else { Trust::Suspended }
+        })
         .collect();
     let odometry = members.iter().flat_map(|&k| chains[k].solved_odometry.iter());
     let (submaps, outcome) = Indexed::new(&start, &gauge).solve(odometry, &loops, &trust, settings);
@@ -304,6 +311,18 @@ fn solve_component(
         component.composed.extend(extend_by_composition(&mut component.map_from_submap, &chains[k].odometry));
     }
     component
+}
+
+/// Loops in the consistent set of a pair of chains that joined.
+fn supported(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
+    let mut out = BTreeSet::new();
+    for (pair, between) in pairs {
+        if let Some(Ok(joined)) = joins.get(pair) {
+            let agreeing = between.iter().zip(&joined.consistent).filter(|(_, consistent)| **consistent);
+            out.extend(agreeing.map(|((edge, _), _)| edge.key.clone()));
+        }
+    }
+    out
 }
 
 /// Loops that do not belong to the consistent set of a pair of chains that joined.

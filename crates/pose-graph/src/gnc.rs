@@ -120,12 +120,14 @@ pub enum Trust {
     Full,
     /// Weighted by its residual from the start.
     Doubted,
-    /// Weight 0 until the end, then by its residual: something else already speaks against it.
+    /// Weight 0 until the end, then by its residual: something speaks against it, or nothing for it.
     Suspended,
 }
 
-/// Most rounds under the final cost; two or three settle it.
-const POLISH_ROUNDS: u32 = 10;
+/// Most rounds under the final cost; a few settle it.
+const POLISH_ROUNDS: u32 = 20;
+/// A loop in use is asked about only if its squared error is above this share of the limit.
+const STRAINED: f64 = 0.25;
 
 /// A solution with the weights that it was reached with.
 #[derive(Clone, Debug, PartialEq)]
@@ -196,8 +198,19 @@ pub fn solve(
                 next[k] = next[k].max(final_weight(robust.kernel, limit, innovation));
             }
         }
-        let change = next.iter().zip(&weights).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-        if !(change > 1e-3) || !connected(problem, &next) {
+        let changed = |next: &[f64]| next.iter().zip(&weights).any(|(a, b)| (a - b).abs() > 1e-3);
+        if robust.kernel == Kernel::TruncatedLeastSquares && !changed(&next) {
+            // A loop in use bends the graph towards itself: ask what the others say without it, and part with the
+            // one that they contradict most.
+            let strained = |&k: &usize| weights[k] > 0.0 && squared(&solved.poses, k) > STRAINED * limit;
+            let strained: Vec<usize> = questioned.iter().copied().filter(strained).collect();
+            let without = solver.innovations(&solved.poses, &weights, &strained)?;
+            let worst = strained.iter().zip(without).max_by(|(_, a), (_, b)| a.total_cmp(b));
+            if let Some((&k, _)) = worst.filter(|(_, squared)| *squared > limit) {
+                next[k] = 0.0;
+            }
+        }
+        if !changed(&next) || !connected(problem, &next) {
             break;
         }
         rounds += 1;

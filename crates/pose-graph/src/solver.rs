@@ -275,9 +275,10 @@ impl<'a> Solver<'a> {
         Ok(&mut self.system)
     }
 
-    /// Squared Mahalanobis errors of the constraints `asked` (of weight zero) against a solution that knows nothing of
-    /// them: `e^T (Omega^-1 + J Sigma J^T)^-1 e` with the solution's covariance Sigma. To first order this is by
-    /// how much twice the cost would rise if the constraint were taken in.
+    /// Squared Mahalanobis errors of the constraints `asked` against a solution that knows nothing of them:
+    /// `e^T (Omega^-1 + J Sigma J^T)^-1 e` with the solution's covariance Sigma for one of weight zero, and with a
+    /// minus for one that is part of the solution. To first order this is by how much twice the cost rises when the
+    /// constraint is taken in, or falls when it is left out. Zero for one that nothing else speaks for or against.
     pub(crate) fn innovations(
         &mut self,
         poses: &[Pose],
@@ -307,12 +308,16 @@ impl<'a> Solver<'a> {
                 }
                 system.solve_in_place(&mut columns, 6);
                 let mut spread = c.information.try_inverse().unwrap_or_else(Matrix6::zeros);
+                let part = weights[k] > 0.0;
+                let sign = if part { -1.0 } else { 1.0 };
                 for (v, jacobian) in &ends {
                     let Some(v) = v else { continue };
-                    spread += jacobian * Matrix6::from_fn(|row, column| columns[column * n + v * 6 + row]);
+                    spread +=
+                        jacobian * Matrix6::from_fn(|row, column| columns[column * n + v * 6 + row]) * sign;
                 }
                 let spread = (spread + spread.transpose()) * 0.5;
-                spread.cholesky().map_or(f64::INFINITY, |factor| at.error.dot(&factor.solve(&at.error)))
+                let alone = if part { 0.0 } else { f64::INFINITY };
+                spread.cholesky().map_or(alone, |factor| at.error.dot(&factor.solve(&at.error)))
             })
             .collect())
     }

@@ -1,22 +1,12 @@
 //! The public pose graphs: the costs that GTSAM reaches are reached from a chordal start.
 
+mod world;
+
 use coma_pose_graph::g2o::G2oGraph;
 use coma_pose_graph::initialise::chordal;
 use coma_pose_graph::{Solved, SolverSettings};
-use std::path::PathBuf;
 use std::time::Instant;
-
-/// The folder with the shared data: `COMA_SHARED`, or a folder `shared` beside one of the parents.
-fn shared_data() -> PathBuf {
-    if let Some(root) = std::env::var_os("COMA_SHARED") {
-        return PathBuf::from(root).join("data");
-    }
-    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
-        .ancestors()
-        .map(|p| p.join("shared/data"))
-        .find(|p| p.is_dir())
-        .expect("the shared data folder: set COMA_SHARED")
-}
+use world::shared_data;
 
 fn optimum(name: &str) -> Solved {
     let path = shared_data().join("pose-graphs").join(name);

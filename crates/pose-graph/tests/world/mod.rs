@@ -4,6 +4,7 @@
 use coma_geometry::{AgentId, Epoch, Matrix6, Pose, SubmapId, Tangent, se3};
 use coma_pose_graph::{Component, Edge, EdgeKey, EdgeKind, GraphEntries, NodeInfo};
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
 pub const ODOMETRY_SIGMA: (f64, f64) = (0.01, 0.004);
 pub const LOOP_SIGMA: (f64, f64) = (0.01, 0.005);
@@ -146,4 +147,16 @@ impl World {
             (m.max(dm), rad.max(drad))
         })
     }
+}
+
+/// The folder with the shared data: `COMA_SHARED`, or a folder `shared` beside one of the parents.
+pub fn shared_data() -> PathBuf {
+    if let Some(root) = std::env::var_os("COMA_SHARED") {
+        return PathBuf::from(root).join("data");
+    }
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+        .ancestors()
+        .map(|p| p.join("shared/data"))
+        .find(|p| p.is_dir())
+        .expect("the shared data folder: set COMA_SHARED")
 }
