@@ -9,7 +9,8 @@ fn lines() -> Vec<(String, Vec<(String, String)>)> {
         let cells: Vec<&str> = row.trim_matches('|').split(" | ").map(str::trim).collect();
         let tests = cells.last().unwrap().split(',').map(|test| {
             let test = test.trim().trim_matches('`');
-            let (folder, name) = test.split_once("::").unwrap_or_else(|| panic!("{row}: {test:?} names no test"));
+            let (folder, name) =
+                test.split_once("::").unwrap_or_else(|| panic!("{row}: {test:?} names no test"));
             (folder.to_string(), name.to_string())
         });
         (cells[0].to_string(), tests.collect())
@@ -24,7 +25,8 @@ fn has_test(folder: &std::path::Path, name: &str) -> bool {
         if path.is_dir() {
             return path.file_name().is_some_and(|name| name != "target") && has_test(&path, name);
         }
-        path.extension().is_some_and(|e| e == "rs") && declares_test(&std::fs::read_to_string(path).unwrap(), name)
+        path.extension().is_some_and(|e| e == "rs")
+            && declares_test(&std::fs::read_to_string(path).unwrap(), name)
     })
 }
 

@@ -60,7 +60,11 @@ pub fn check(root: &Path) -> Result<()> {
     for package in &metadata.packages {
         *tally.entry(package.license.as_deref().unwrap_or("none")).or_default() += 1;
     }
-    println!("deny: {} packages under {} licence expressions, all allowed", metadata.packages.len(), tally.len());
+    println!(
+        "deny: {} packages under {} licence expressions, all allowed",
+        metadata.packages.len(),
+        tally.len()
+    );
     if answers(&["cargo", "deny", "--version"]) {
         return command(root, &["cargo", "deny", "--locked", "check", "licenses", "bans", "sources"], &[]);
     }

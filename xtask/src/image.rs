@@ -54,8 +54,10 @@ pub fn run(root: &Path, options: &Options) -> Result<()> {
         let names: Vec<_> = IMAGES.iter().map(|image| image.name).collect();
         bail!("--only {unknown}: the images are {}", names.join(", "));
     }
-    let wanted: Vec<&Image> =
-        IMAGES.iter().filter(|i| options.only.is_empty() || options.only.iter().any(|n| n == i.name)).collect();
+    let wanted: Vec<&Image> = IMAGES
+        .iter()
+        .filter(|i| options.only.is_empty() || options.only.iter().any(|n| n == i.name))
+        .collect();
     let target = host_target()?;
     timed("static programs", || build_static(root, &target, &wanted))?;
     let mut contexts = Vec::new();
@@ -80,7 +82,9 @@ pub fn run(root: &Path, options: &Options) -> Result<()> {
         let tag = format!("coma/{}:{}", image.name, options.tag);
         let file = root.join("docker").join(format!("{}.Dockerfile", image.name));
         let file = file.to_str().context("the repository's path is not UTF-8")?;
-        timed(&tag, || command(&context, &["docker", "build", "--quiet", "--tag", &tag, "--file", file, "."], &[]))?;
+        timed(&tag, || {
+            command(&context, &["docker", "build", "--quiet", "--tag", &tag, "--file", file, "."], &[])
+        })?;
     }
     Ok(())
 }
@@ -99,7 +103,8 @@ fn build_static(root: &Path, target: &str, images: &[&Image]) -> Result<()> {
 fn host_target() -> Result<String> {
     let output = Command::new("rustc").arg("-vV").output().context("starting rustc")?;
     let text = String::from_utf8_lossy(&output.stdout);
-    let host = text.lines().find_map(|line| line.strip_prefix("host: ")).context("rustc -vV names no host")?;
+    let host =
+        text.lines().find_map(|line| line.strip_prefix("host: ")).context("rustc -vV names no host")?;
     if !host.ends_with("-linux-gnu") {
         bail!("images are built on Linux with glibc, not on {host}");
     }

@@ -231,13 +231,17 @@ mod tests {
 
     #[test]
     fn a_lifetime_is_not_a_character() {
-        assert_eq!(named("fn f<'a>(x: &'a u8) { tokio('ä', '\\'') }"), ["fn", "f", "a", "x", "a", "u8", "tokio"]);
+        assert_eq!(
+            named("fn f<'a>(x: &'a u8) { tokio('ä', '\\'') }"),
+            ["fn", "f", "a", "x", "a", "u8", "tokio"]
+        );
     }
 
     #[test]
     fn use_trees_are_written_out() {
         let source = "use std::{fs, time::{self, Duration, Instant as Now}, net::*};";
-        let expected = ["std::fs", "std::time", "std::time::Duration", "std::time::Instant as Now", "std::net::*"];
+        let expected =
+            ["std::fs", "std::time", "std::time::Duration", "std::time::Instant as Now", "std::net::*"];
         assert_eq!(named(source), expected);
     }
 

@@ -58,13 +58,17 @@ fn violations_of(krate: &Crate) -> Vec<String> {
         {
             found.push(format!("{name} imports {target}, which only {} may know", places.join(", ")));
         } else if import.dev && own < EDGE_LAYER && EDGE_ONLY.contains(&target) {
-            found.push(format!("{name} (layer {own}) imports {target} in its tests: it is pure below {EDGE_LAYER}"));
+            found.push(format!(
+                "{name} (layer {own}) imports {target} in its tests: it is pure below {EDGE_LAYER}"
+            ));
         }
     }
     if own < EDGE_LAYER {
         let reached = EDGE_ONLY.iter().filter(|outside| krate.closure.contains(**outside));
         found.extend(reached.map(|outside| {
-            format!("{name} (layer {own}) is built with {outside}: no network, clock or async below {EDGE_LAYER}")
+            format!(
+                "{name} (layer {own}) is built with {outside}: no network, clock or async below {EDGE_LAYER}"
+            )
         }));
     }
     found
@@ -72,7 +76,9 @@ fn violations_of(krate: &Crate) -> Vec<String> {
 
 fn ours(name: &str, own: u8, import: &Import) -> Option<String> {
     let target = import.name.as_str();
-    let Some(other) = layer(target) else { return Some(format!("{name} imports {target}, which has no layer")) };
+    let Some(other) = layer(target) else {
+        return Some(format!("{name} imports {target}, which has no layer"));
+    };
     if import.dev && IN_TESTS.contains(&target) {
         return None;
     }
@@ -196,12 +202,19 @@ mod tests {
 
     #[test]
     fn outside_crates_stay_in_their_place() {
-        for (outside_crate, at_home) in
-            [("prost", "wire"), ("tonic", "agent"), ("ort", "encoder"), ("wgpu", "raster"), ("axum", "viewer-gateway")]
-        {
+        for (outside_crate, at_home) in [
+            ("prost", "wire"),
+            ("tonic", "agent"),
+            ("ort", "encoder"),
+            ("wgpu", "raster"),
+            ("axum", "viewer-gateway"),
+        ] {
             assert!(!refused(at_home, outside(outside_crate)), "{outside_crate} in {at_home}");
             assert!(refused("store", outside(outside_crate)), "{outside_crate} in store");
-            assert!(refused("store", in_tests(outside(outside_crate))), "{outside_crate} in the tests of store");
+            assert!(
+                refused("store", in_tests(outside(outside_crate))),
+                "{outside_crate} in the tests of store"
+            );
         }
     }
 
