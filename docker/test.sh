@@ -21,7 +21,7 @@ COMA_TOKEN="test-$$-$RANDOM"
 COMA_GATEWAY_PORT="$(python3 -c 'import socket; s = socket.socket(); s.bind(("127.0.0.1", 0)); print(s.getsockname()[1])')"
 export COMA_TOKEN COMA_GATEWAY_PORT
 work="$(mktemp -d)"
-daemon="" started=""
+daemon="" started="" bridged=0
 
 cleanup() {
     status=$?
@@ -34,7 +34,7 @@ cleanup() {
         # A daemon leaves its bridge and its packet rules behind: put back what was there before.
         ip link delete docker0 2> /dev/null || true
         iptables-restore < "$work/iptables" 2> /dev/null || true
-        sysctl --quiet --write net.bridge.bridge-nf-call-iptables=0 2> /dev/null || true
+        sysctl --quiet --write "net.bridge.bridge-nf-call-iptables=$bridged" 2> /dev/null || true
     fi
     rm -rf "$work"
 }
@@ -43,6 +43,7 @@ trap cleanup EXIT
 if ! docker info > /dev/null 2>&1; then
     [ "$(id -u)" = 0 ] && command -v dockerd > /dev/null || skip "no Docker daemon answers, and none can be started here"
     iptables-save > "$work/iptables" 2> /dev/null || true
+    bridged="$(sysctl --values net.bridge.bridge-nf-call-iptables 2> /dev/null || echo 0)"
     dockerd > "$work/dockerd.log" 2>&1 &
     daemon=$!
     for _ in $(seq 60); do

@@ -45,7 +45,7 @@ pub const FENCED: &[(&[&str], &[&str])] = &[
     (&["ort", "ort-sys"], &["encoder"]),
     (&["wgpu", "naga", "naga_oil"], &["raster"]),
     (&["axum", "utoipa"], &["viewer-gateway"]),
-    (&["chitchat", "mdns-sd"], &["agent"]),
+    (&["chitchat", "mdns-sd"], &["runtime", "agent"]),
 ];
 
 /// Outside crates that nothing below [`EDGE_LAYER`] may import, directly or through others: async
