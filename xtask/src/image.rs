@@ -1,7 +1,8 @@
 //! Images FROM scratch: one static program each, no shell, no system library.
 //!
-//! A static program cannot load ONNX Runtime, which is a shared library. So the static images know the
-//! builtin place descriptor only, and `--onnxruntime` makes one more, `coma/place-recognition-onnx`, with a
+//! ONNX Runtime is a shared library, and a static program loads one only together with a second, equal copy
+//! of the system's libraries, which a FROM scratch image does not have. So the static images know the builtin
+//! place descriptor only, and `--onnxruntime` makes one more, `coma/place-recognition-onnx`, with a
 //! dynamic program, ONNX Runtime and the very libraries that both are linked to on this machine.
 
 use crate::steps::{answers, command, timed};

@@ -3,6 +3,7 @@
 use anyhow::{Context, Result};
 use clap::{Parser, Subcommand};
 use std::path::{Path, PathBuf};
+use std::process::ExitCode;
 
 mod ci;
 #[cfg(test)]
@@ -33,9 +34,19 @@ enum Task {
     Image(image::Options),
 }
 
-fn main() -> Result<()> {
+fn main() -> ExitCode {
+    match run(Arguments::parse().task) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("xtask: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(task: Task) -> Result<()> {
     let root = root();
-    match Arguments::parse().task {
+    match task {
         Task::Layers => layers::check(&root),
         Task::Deny => deny::check(&root),
         Task::Ci => ci::run(&root),
