@@ -97,7 +97,10 @@ fn build_static(root: &Path, target: &str, images: &[&Image]) -> Result<()> {
     for image in images {
         line.extend(["--package", image.package]);
     }
-    command(root, &line, &[("RUSTFLAGS", "-C target-feature=+crt-static")])
+    // Line tables would be most of an image; the names of functions stay for a readable panic.
+    let environment =
+        [("RUSTFLAGS", "-C target-feature=+crt-static"), ("CARGO_PROFILE_RELEASE_STRIP", "debuginfo")];
+    command(root, &line, &environment)
 }
 
 /// The toolchain's own target, as images run on the kind of machine that made them.
