@@ -108,3 +108,38 @@ impl Image<[f32; 3]> {
         self.map(|c| c.map(|v| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_are_row_by_row_and_an_index_is_x_then_y() {
+        let image = Image::from_pixels(3, 2, vec![0, 1, 2, 3, 4, 5]).unwrap();
+        assert_eq!(image[(2, 0)], 2);
+        assert_eq!(image[(0, 1)], 3);
+        assert_eq!(image.row(1), [3, 4, 5]);
+        assert!(image.get(0, 2).is_none());
+        assert!(Image::from_pixels(3, 2, vec![0; 5]).is_none());
+    }
+
+    #[test]
+    fn unit_colour_runs_from_zero_to_one_and_goes_back_to_the_same_bytes() {
+        let bytes = Image::from_fn(16, 16, |x, y| [(16 * y + x) as u8, 0, 255]);
+        let unit = bytes.to_unit();
+        assert_eq!(unit[(0, 0)], [0.0, 0.0, 1.0]);
+        assert_eq!(unit.to_bytes(), bytes);
+        let beyond = Image::filled(1, 1, [-0.5f32, 1.5, f32::NAN]);
+        assert_eq!(beyond.to_bytes()[(0, 0)], [0, 255, 0]);
+    }
+
+    #[test]
+    fn luminance_is_rec_601_from_zero_to_one() {
+        let of = |color| Image::filled(1, 1, color).luminance()[(0, 0)];
+        for (color, expected) in
+            [([255, 255, 255], 1.0), ([255, 0, 0], 0.299), ([0, 255, 0], 0.587), ([0, 0, 255], 0.114)]
+        {
+            assert!((of(color) - expected).abs() < 1e-6, "{color:?}");
+        }
+    }
+}

@@ -27,3 +27,15 @@ impl DepthNoise {
         self.base_m + self.quadratic_per_m * z_m * z_m
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sigma_grows_with_the_square_of_depth() {
+        let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.002 };
+        assert!((noise.sigma_m(1.0) - 0.003).abs() < 1e-7);
+        assert!((noise.sigma_m(3.0) - 0.019).abs() < 1e-7);
+    }
+}

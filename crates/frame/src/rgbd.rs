@@ -77,3 +77,34 @@ impl RgbdFrame {
         measured as f32 / self.depth_m.pixels().len() as f32
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CAMERA: Intrinsics = Intrinsics { width: 8, height: 8, fx: 8.0, fy: 8.0, cx: 3.5, cy: 3.5 };
+
+    fn frame(color: Image<[u8; 3]>, depth_m: Image<f32>) -> Result<RgbdFrame, FrameError> {
+        RgbdFrame::new(0, StampNs(0), CAMERA, DepthNoise::default(), color, depth_m)
+    }
+
+    #[test]
+    fn zero_depth_is_no_measurement_and_what_is_no_depth_becomes_zero() {
+        let mut depth = Image::filled(8, 8, 2.0f32);
+        for (x, bad) in [f32::NAN, f32::INFINITY, -1.0, 0.0].into_iter().enumerate() {
+            depth[(x, 0)] = bad;
+        }
+        let frame = frame(Image::filled(8, 8, [0; 3]), depth).unwrap();
+        assert_eq!(frame.depth_m.row(0), [0.0, 0.0, 0.0, 0.0, 2.0, 2.0, 2.0, 2.0]);
+        assert_eq!(frame.depth_coverage(), 60.0 / 64.0);
+    }
+
+    #[test]
+    fn images_of_another_size_than_the_camera_are_refused_by_name() {
+        let field = |color, depth| match frame(color, depth).unwrap_err() {
+            FrameError::Size { field, .. } => field,
+        };
+        assert_eq!(field(Image::filled(7, 8, [0; 3]), Image::filled(8, 8, 1.0)), "color");
+        assert_eq!(field(Image::filled(8, 8, [0; 3]), Image::filled(8, 9, 1.0)), "depth");
+    }
+}

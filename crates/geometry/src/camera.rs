@@ -48,13 +48,13 @@ impl Intrinsics {
         side("width", self.width)?;
         side("height", self.height)?;
         for (field, value) in [("fx", self.fx), ("fy", self.fy)] {
-            if !(value.is_finite() && value >= 1.0 && value <= 1e6) {
+            if !(1.0..=1e6).contains(&value) {
                 return Err(IntrinsicsError { field, value, needed: "1 to 1e6 pixels" });
             }
         }
         for (field, value, side) in [("cx", self.cx, self.width), ("cy", self.cy, self.height)] {
             let side = side as f64;
-            if !(value.is_finite() && value >= -side && value <= 2.0 * side) {
+            if !(-side..=2.0 * side).contains(&value) {
                 return Err(IntrinsicsError { field, value, needed: "within one image size of the image" });
             }
         }
@@ -164,5 +164,22 @@ mod tests {
         assert_eq!(refused(Intrinsics { fy: 0.0, ..CAMERA }), "fy");
         assert_eq!(refused(Intrinsics { width: 0, ..CAMERA }), "width");
         assert_eq!(refused(Intrinsics { cy: f64::INFINITY, ..CAMERA }), "cy");
+    }
+
+    #[test]
+    fn camera_axes_point_right_down_and_forward() {
+        let pixel = |x, y, z| CAMERA.project(&Point3::new(x, y, z));
+        let centre = pixel(0.0, 0.0, 1.0).unwrap();
+        assert!(pixel(0.1, 0.0, 1.0).unwrap().x > centre.x, "x is to the right");
+        assert!(pixel(0.0, 0.1, 1.0).unwrap().y > centre.y, "y is down, as image rows are");
+        assert!(pixel(0.0, 0.0, -1.0).is_none(), "what lies behind is not seen");
+    }
+
+    #[test]
+    fn distortion_has_opencv_s_order_and_meaning() {
+        // cv2.projectPoints of (0.3, -0.2, 1) with the coefficients (k1, k2, p1, p2, k3) below.
+        let lens = Distortion { k1: -0.2, k2: 0.05, p1: 0.001, p2: -0.002, k3: 0.03 };
+        let (x, y) = lens.distort(0.3, -0.2);
+        assert!((x - 0.291733273).abs() < 1e-12 && (y - (-0.194532182)).abs() < 1e-12, "{x} {y}");
     }
 }

@@ -222,4 +222,23 @@ mod tests {
             assert!((product - Matrix6::identity()).norm() < 1e-9, "{xi:?}");
         }
     }
+
+    #[test]
+    fn a_from_b_maps_points_of_b_and_names_that_touch_compose() {
+        // The submap lies 1 m along the map's x, turned by 90 degrees about z; the camera 2 m along its x.
+        let quarter_turn = UnitQuaternion::from_scaled_axis(Vector3::z() * std::f64::consts::FRAC_PI_2);
+        let map_from_submap = Pose::from_parts(Translation3::new(1.0, 0.0, 0.0), quarter_turn);
+        let submap_from_camera = Pose::translation(2.0, 0.0, 0.0);
+        let map_from_camera = map_from_submap * submap_from_camera;
+        let camera_in_map = map_from_camera * nalgebra::Point3::origin();
+        assert!((camera_in_map.coords - Vector3::new(1.0, 2.0, 0.0)).norm() < 1e-12, "{camera_in_map}");
+    }
+
+    #[test]
+    fn distances_are_metres_and_radians() {
+        let quarter_turn = UnitQuaternion::from_scaled_axis(Vector3::y() * std::f64::consts::FRAC_PI_2);
+        let (metres, radians) =
+            distance(&Pose::identity(), &Pose::from_parts(Translation3::new(3.0, 0.0, 4.0), quarter_turn));
+        assert!((metres - 5.0).abs() < 1e-12 && (radians - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
+    }
 }

@@ -18,3 +18,15 @@ impl StampNs {
         StampNs((seconds * 1e9).round() as i64)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stamps_are_signed_nanoseconds() {
+        assert_eq!(StampNs::from_seconds(1.5), StampNs(1_500_000_000));
+        assert_eq!(StampNs(-250_000_000).seconds(), -0.25);
+        assert!(StampNs(-1) < StampNs(0));
+    }
+}

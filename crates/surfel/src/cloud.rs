@@ -107,3 +107,35 @@ impl Surfel {
         *UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)).to_rotation_matrix().matrix()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SURFEL: Surfel = Surfel {
+        center_m: [1.0, 2.0, 3.0],
+        rotation_wxyz: [1.0, 0.0, 0.0, 0.0],
+        scale_m: [0.01, 0.02],
+        opacity: 0.5,
+        color: [0.1, 0.2, 0.3],
+    };
+
+    #[test]
+    fn rotation_is_w_x_y_z_and_its_columns_are_the_tangents_and_the_normal() {
+        assert_eq!(SURFEL.rotation(), Matrix3::identity());
+        // A quarter turn about x, (cos 45, sin 45, 0, 0), turns the second tangent to z and the normal to -y.
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        let turned = Surfel { rotation_wxyz: [half, half, 0.0, 0.0], ..SURFEL }.rotation();
+        let expected = Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0);
+        assert!((turned - expected).norm() < 1e-6, "{turned}");
+    }
+
+    #[test]
+    fn columns_give_back_the_surfels_in_order_and_stay_equally_long() {
+        let other = Surfel { opacity: 0.25, ..SURFEL };
+        let mut cloud: SurfelCloud = [SURFEL, other, SURFEL].into_iter().collect();
+        assert_eq!(cloud.iter().collect::<Vec<_>>(), [SURFEL, other, SURFEL]);
+        cloud.retain(&[false, true, true]);
+        assert_eq!(cloud.iter().collect::<Vec<_>>(), [other, SURFEL]);
+    }
+}
