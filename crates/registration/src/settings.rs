@@ -119,9 +119,9 @@ impl Default for Settings {
             weak_ratio: 0.05,
             depth_tolerance_m: 0.02,
             depth_tolerance_sigmas: 3.0,
-            min_overlap: 0.15,
-            max_conflict: 0.15,
-            min_correlation: 0.4,
+            min_overlap: 0.2,
+            max_conflict: 0.08,
+            min_correlation: 0.6,
             min_contrast: 0.03,
         }
     }
