@@ -8,7 +8,7 @@ use crate::outcome::{Alignment, Outcome, Reason, Side};
 use crate::settings::Settings;
 use crate::verify;
 use crate::view::{Prepared, View};
-use coma_geometry::{Matrix6, Pose};
+use coma_geometry::{Matrix6, Pose, se3};
 
 /// A coarse alignment that the views do not contradict outright.
 #[derive(Clone, Debug, PartialEq)]
@@ -69,10 +69,13 @@ pub fn align_prepared(source: &Prepared, target: &Prepared, settings: &Settings,
         }
     }
     hypotheses.sort_by(|a, b| b.score.total_cmp(&a.score));
-    hypotheses.truncate(settings.verified_hypotheses.max(1));
     let mut best: Option<(f64, Alignment)> = None;
     let mut first_reason = None;
-    for hypothesis in &hypotheses {
+    for hypothesis in distinct(hypotheses).iter().take(settings.verified_hypotheses.max(1)) {
+        // Refinement gains little on the score: one that lies this far behind will not catch up.
+        if best.as_ref().is_some_and(|b| hypothesis.score < 0.8 * b.0) {
+            break;
+        }
         match judged(source, target, hypothesis, settings) {
             Ok((score, alignment)) => {
                 if best.as_ref().is_none_or(|b| score > b.0) {
@@ -87,6 +90,21 @@ pub fn align_prepared(source: &Prepared, target: &Prepared, settings: &Settings,
         (None, Some(reason)) => Outcome::Rejected(reason),
         (None, None) => Outcome::Rejected(Reason::TooFewInliers { found: 0, needed: settings.min_inliers }),
     }
+}
+
+/// The first of every group of hypotheses that converged to one pose.
+fn distinct(hypotheses: Vec<Hypothesis>) -> Vec<Hypothesis> {
+    let mut kept: Vec<Hypothesis> = Vec::new();
+    for hypothesis in hypotheses {
+        let is_new = kept.iter().all(|k| {
+            let (m, rad) = se3::distance(&k.target_from_source, &hypothesis.target_from_source);
+            m > 0.03 || rad > 0.02
+        });
+        if is_new {
+            kept.push(hypothesis);
+        }
+    }
+    kept
 }
 
 /// Refines one hypothesis and verifies it; the score ranks it against others.

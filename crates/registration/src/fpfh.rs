@@ -8,10 +8,8 @@ use rayon::prelude::*;
 
 /// Three angles of 11 bins each.
 pub const BINS: usize = 33;
-/// [`BINS`], filled up with zeros to whole SIMD lanes.
-pub const STRIDE: usize = 40;
 /// A histogram; each of its three parts sums to 200 (or 0 where the point has no neighbours).
-pub type Feature = [f32; STRIDE];
+pub type Feature = [f32; BINS];
 
 /// One feature per point of a cloud that has normals. Points without a normal get a zero feature.
 pub fn features(cloud: &PointCloud, radius_m: f32, neighbours: usize) -> Vec<Feature> {
@@ -29,7 +27,7 @@ pub fn features(cloud: &PointCloud, radius_m: f32, neighbours: usize) -> Vec<Fea
     (0..cloud.len())
         .into_par_iter()
         .map(|i| {
-            let mut out = [0.0f32; STRIDE];
+            let mut out = [0.0f32; BINS];
             if cloud.normals[i] == Vector3::zeros() {
                 return out;
             }
@@ -57,7 +55,7 @@ pub fn features(cloud: &PointCloud, radius_m: f32, neighbours: usize) -> Vec<Fea
 
 /// Simplified histogram of one point against its neighbours; each part sums to 100.
 fn spfh(cloud: &PointCloud, i: usize, near: &[(usize, f32)]) -> Feature {
-    let mut out = [0.0f32; STRIDE];
+    let mut out = [0.0f32; BINS];
     if cloud.normals[i] == Vector3::zeros() || near.is_empty() {
         return out;
     }

@@ -198,6 +198,9 @@ pub fn depth_weight(sigma_m: f64) -> f64 {
     (FULL_WEIGHT_SIGMA_M / sigma_m).powi(2).min(1.0)
 }
 
+/// A scale has converged when a step is below this many voxels (and as many radians per metre).
+const CONVERGED_VOXELS: f64 = 0.01;
+
 /// Gauss-Newton at one scale. `None` if correspondences run out or the system is singular beyond damping.
 pub fn refine_scale(
     source: &Searchable,
@@ -233,7 +236,8 @@ pub fn refine_scale(
         }
         pose *= se3::exp(&step);
         pose.rotation.renormalize();
-        if step.fixed_rows::<3>(0).norm() < 1e-4 && step.fixed_rows::<3>(3).norm() < 1e-4 {
+        let small = CONVERGED_VOXELS * scale.voxel_m as f64;
+        if step.fixed_rows::<3>(0).norm() < small && step.fixed_rows::<3>(3).norm() < small {
             break;
         }
     }

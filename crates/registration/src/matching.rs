@@ -1,6 +1,6 @@
 //! Which features of two clouds belong together: nearest neighbours in 33 dimensions, in both directions.
 
-use crate::fpfh::{Feature, STRIDE};
+use crate::fpfh::{BINS, Feature};
 use multiversion::multiversion;
 use rayon::prelude::*;
 
@@ -34,8 +34,26 @@ pub fn mutual_matches(source: &[Feature], target: &[Feature], k: usize) -> Vec<M
     matches
 }
 
+/// Features side by side: `[bin][lane]`, so that one instruction serves many features.
+type Block = [[f32; LANES]; BINS];
+/// Features per block.
+const LANES: usize = 16;
+
 /// For every query its `k` nearest features: squared distance and index, nearest first, ties by index.
 fn nearest(queries: &[Feature], features: &[Feature], k: usize) -> Vec<Vec<(f32, u32)>> {
+    let blocks: Vec<Block> = features
+        .chunks(LANES)
+        .map(|chunk| {
+            // Lanes without a feature are infinitely far away.
+            let mut block = [[f32::INFINITY; LANES]; BINS];
+            for (lane, feature) in chunk.iter().enumerate() {
+                for bin in 0..BINS {
+                    block[bin][lane] = feature[bin];
+                }
+            }
+            block
+        })
+        .collect();
     queries
         .par_iter()
         .map(|query| {
@@ -43,8 +61,8 @@ fn nearest(queries: &[Feature], features: &[Feature], k: usize) -> Vec<Vec<(f32,
             if query.iter().all(|v| *v == 0.0) {
                 return best;
             }
-            let mut distances = vec![0.0f32; features.len()];
-            squared_distances(query, features, &mut distances);
+            let mut distances = vec![0.0f32; blocks.len() * LANES];
+            squared_distances(query, &blocks, &mut distances);
             let mut limit = f32::INFINITY;
             for (i, &d2) in distances.iter().enumerate() {
                 if d2 < limit {
@@ -61,18 +79,18 @@ fn nearest(queries: &[Feature], features: &[Feature], k: usize) -> Vec<Vec<(f32,
         .collect()
 }
 
-/// Squared Euclidean distances; eight running sums, so that the compiler may use SIMD in a fixed order.
+/// Squared Euclidean distances of one feature to all; each lane sums in the order of the bins.
 #[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2+fma", "aarch64+neon"))]
-fn squared_distances(query: &Feature, features: &[Feature], out: &mut [f32]) {
-    for (feature, out) in features.iter().zip(out) {
-        let mut sums = [0.0f32; 8];
-        for chunk in 0..STRIDE / 8 {
-            for lane in 0..8 {
-                let d = query[chunk * 8 + lane] - feature[chunk * 8 + lane];
+fn squared_distances(query: &Feature, blocks: &[Block], out: &mut [f32]) {
+    for (block, out) in blocks.iter().zip(out.chunks_exact_mut(LANES)) {
+        let mut sums = [0.0f32; LANES];
+        for bin in 0..BINS {
+            for lane in 0..LANES {
+                let d = query[bin] - block[bin][lane];
                 sums[lane] += d * d;
             }
         }
-        *out = (sums[0] + sums[4]) + (sums[1] + sums[5]) + (sums[2] + sums[6]) + (sums[3] + sums[7]);
+        out.copy_from_slice(&sums);
     }
 }
 
@@ -81,8 +99,8 @@ mod tests {
     use super::*;
 
     fn feature(seed: usize) -> Feature {
-        let mut f = [0.0; STRIDE];
-        for (b, v) in f.iter_mut().take(33).enumerate() {
+        let mut f = [0.0; BINS];
+        for (b, v) in f.iter_mut().enumerate() {
             *v = ((seed * 7919 + b * 104_729) % 101) as f32;
         }
         f
@@ -99,7 +117,7 @@ mod tests {
 
     #[test]
     fn zero_features_match_nothing() {
-        let zero = vec![[0.0; STRIDE]; 5];
+        let zero = vec![[0.0; BINS]; 5];
         assert!(mutual_matches(&zero, &zero, 1).is_empty());
         assert!(mutual_matches(&[], &zero, 1).is_empty());
     }

@@ -3,7 +3,7 @@
 mod support;
 
 use coma_geometry::se3;
-use coma_registration::{Outcome, Settings, align};
+use coma_registration::{Outcome, Prepared, Settings, Side, View, align, align_prepared};
 use support::{Sequence, shared};
 
 #[test]
@@ -50,4 +50,27 @@ fn wide_baselines_of_a_kitchen_are_registered_and_none_wrongly() {
     println!("{good} of {count} within 3 degrees and 5 cm, {wrong} accepted wrongly");
     assert!(good >= 13, "{good} of {count}");
     assert_eq!(wrong, 0);
+}
+
+#[test]
+#[ignore = "needs the shared data folder"]
+fn views_that_share_nothing_are_never_registered() {
+    let kitchen = Sequence::open(&shared().join("data/kitchen"));
+    let living_room = Sequence::open(&shared().join("data/living-room/agent-0"));
+    let settings = Settings::default();
+    let prepared = |view: &View| Prepared::new(view, &settings, Side::Source).unwrap();
+    let rooms: Vec<Prepared> = (0..240).step_by(80).map(|i| prepared(&living_room.view(i))).collect();
+    for i in (0..500).step_by(100) {
+        let view = prepared(&kitchen.view(i));
+        for (j, room) in rooms.iter().enumerate() {
+            let outcome = align_prepared(&view, room, &settings, 7);
+            assert!(outcome.alignment().is_none(), "kitchen {i}, living room {}: {outcome:?}", j * 80);
+        }
+    }
+    // Frames of one kitchen whose views overlap by less than 17 %: most alike of those that are not one place.
+    let pairs = [(75, 450), (50, 425), (75, 175), (325, 450), (50, 375), (25, 375), (100, 200), (200, 375)];
+    for (i, j) in pairs {
+        let outcome = align_prepared(&prepared(&kitchen.view(i)), &prepared(&kitchen.view(j)), &settings, 7);
+        assert!(outcome.alignment().is_none(), "kitchen {i} and {j}: {outcome:?}");
+    }
 }
