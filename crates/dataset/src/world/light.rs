@@ -32,7 +32,7 @@ pub struct LightMap {
 const NODE_M: f32 = 0.14;
 /// Rays towards each light source, and rays that look for near surfaces.
 const SHADOW_RAYS: u32 = 4;
-const CORNER_RAYS: u32 = 16;
+const CORNER_RAYS: u32 = 12;
 /// Surfaces nearer than this dim a corner, metres.
 const CORNER_M: f32 = 0.7;
 /// Light that comes from everywhere.

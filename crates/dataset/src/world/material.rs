@@ -11,7 +11,7 @@ pub type Rgb = [f32; 3];
 pub enum Material {
     /// Painted plaster: faint mottling.
     Plaster(Rgb),
-    /// Wallpaper: a printed pattern of leaves in two tones.
+    /// Wallpaper: printed leaves, ground and leaf.
     Wallpaper(Rgb, Rgb),
     /// Planks of this width (m) along `a` (true) or `b`, with grain between two tones.
     Wood(Rgb, Rgb, f32, bool),
@@ -91,11 +91,21 @@ impl Material {
         match *self {
             Material::Plaster(base) => scaled(base, 1.0 + 0.11 * octaves(a, b, 0.45, 5, w, seed)),
             Material::Wallpaper(base, leaf) => {
-                let bend = 0.03 * value(a * 5.0, b * 5.0, seed);
-                let pattern = value((a + bend) / 0.07, b / 0.13, seed ^ 5) - 0.1;
-                let shade = 1.0 + 0.06 * octaves(a, b, 0.1, 3, w, seed ^ 9);
-                let fade = (0.1 / w - 1.0).clamp(0.0, 1.0);
-                scaled(mix(base, leaf, 0.2 + fade * (step(pattern, 0.1 + w * 8.0) - 0.2)), shade)
+                // Leaning leaves in staggered columns, each printed a little differently.
+                let column = (a / 0.12).floor();
+                let shift = if column.rem_euclid(2.0) < 0.5 { 0.0 } else { 0.5 };
+                let row = (b / 0.16 + shift).floor();
+                let leaf_seed = hash(column as i32 as u32, hash(row as i32 as u32, seed));
+                let (u, v) = (a / 0.12 - column - 0.5, b / 0.16 + shift - row - 0.5);
+                let lean = 0.9 * (unit(leaf_seed, 1) - 0.5) + if shift > 0.0 { 0.6 } else { -0.6 };
+                let (p, q) = (u * lean.cos() - v * lean.sin(), u * lean.sin() + v * lean.cos());
+                let length = 0.34 + 0.10 * unit(leaf_seed, 2);
+                let inside = (1.0 - (p / 0.17).powi(2) - (q / length).powi(2)) * 0.5;
+                let vein = step(p.abs() - 0.012, 0.01 + w * 6.0);
+                let shade = 1.0 + 0.10 * octaves(a, b, 0.3, 5, w, seed ^ 9);
+                let fade = (0.12 / w - 1.0).clamp(0.0, 1.0);
+                let printed = step(inside, 0.06 + w * 6.0) * (0.5 + 0.5 * vein) * (0.6 + 0.4 * unit(leaf_seed, 3));
+                scaled(mix(base, leaf, 0.3 + fade * (printed - 0.3)), shade)
             }
             Material::Wood(light, dark, plank_m, along_a) => {
                 let (along, across) = if along_a { (a, b) } else { (b, a) };

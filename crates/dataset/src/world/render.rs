@@ -62,6 +62,8 @@ pub fn render(scene: &Scene, light: &LightMap, camera: &Intrinsics, world_from_c
             let uniform =
                 inside && same(x - 1, y) && same(x + 1, y) && same(x, y - 1) && same(x, y + 1) && here.hit.is_some();
             let mut sum = [0.0f32; 3];
+            // Light varies over decimetres: one look-up serves a pixel that shows one surface.
+            let mut shared_brightness = None;
             for (du, dv) in OFFSETS {
                 let direction = ray(x as f64 + du, y as f64 + dv);
                 let known = here.hit.filter(|_| uniform).and_then(|hit| {
@@ -73,7 +75,9 @@ pub fn render(scene: &Scene, light: &LightMap, camera: &Intrinsics, world_from_c
                 let point = object.surface_point(&(origin + direction * hit.t));
                 let footprint_m = hit.t / camera.fx as f32 * 0.6 / here.facing.max(0.25);
                 let reflectance = object.material.reflectance(&point, object.seed, footprint_m);
-                let brightness = light.at(hit.object, object, &point);
+                let look_up = || light.at(hit.object, object, &point);
+                let brightness =
+                    if uniform { *shared_brightness.get_or_insert_with(look_up) } else { look_up() };
                 for c in 0..3 {
                     sum[c] += 0.25 * brightness * reflectance[c];
                 }

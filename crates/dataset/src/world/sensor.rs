@@ -40,6 +40,7 @@ impl Default for SensorNoise {
 const JUMP: f32 = 0.04;
 /// Brightness of a picture before exposure drift.
 const EXPOSURE: f32 = 0.92;
+const GAMMA_STEPS: usize = 4096;
 
 /// Turns a clean picture into sRGB bytes and depth codes. `seed` differs for every frame.
 pub fn expose(
@@ -57,11 +58,14 @@ pub fn expose(
         1.0 + n.exposure_drift * (0.7 * (t / 41.0).sin() + 0.3 * (t / 17.0).sin())
     };
     let gain = EXPOSURE * noise.map_or(1.0, drift);
+    // Display gamma by table: 1/4096 steps are finer than a byte's everywhere above the darkest codes.
+    let gamma: Vec<f32> =
+        (0..=GAMMA_STEPS).map(|i| 255.0 * (i as f32 / GAMMA_STEPS as f32).powf(1.0 / 2.2)).collect();
     let color = Image::from_fn(width, height, |x, y| {
         let pixel = (y * width + x) as u32;
         let linear = picture.color[(x, y)];
         std::array::from_fn(|c| {
-            let clean = 255.0 * (linear[c] * gain).clamp(0.0, 1.0).powf(1.0 / 2.2);
+            let clean = gamma[((linear[c] * gain).clamp(0.0, 1.0) * GAMMA_STEPS as f32 + 0.5) as usize];
             let error = noise.map_or(0.0, |n| n.color_sigma * normal(pixel, seed ^ (c as u32 + 1)));
             (clean + error).round().clamp(0.0, 255.0) as u8
         })
