@@ -14,6 +14,7 @@ pub mod camera;
 pub mod id;
 pub mod se3;
 pub mod time;
+pub mod tum;
 
 pub use camera::{Distortion, Intrinsics, IntrinsicsError};
 pub use id::{AgentId, Epoch, InvalidAgentId, KeyframeId, SubmapId};
