@@ -1,1 +1,3 @@
 //! coma-slam
+
+pub mod log;
