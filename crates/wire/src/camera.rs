@@ -139,7 +139,8 @@ impl Wire for Calibration {
         let color: Intrinsics = at.field("color").required(m.color)?;
         let depth: Option<Intrinsics> = at.field("depth").optional(m.depth)?;
         let color_from_depth: Option<Pose> = at.field("color_from_depth").optional(m.color_from_depth)?;
-        let depth_distortion: Option<Distortion> = at.field("depth_distortion").optional(m.depth_distortion)?;
+        let depth_distortion: Option<Distortion> =
+            at.field("depth_distortion").optional(m.depth_distortion)?;
         if depth.is_none() && (color_from_depth.is_some() || depth_distortion.is_some()) {
             return Err(at.field("depth").refuse(
                 "is missing, but color_from_depth or depth_distortion says that depth has its own camera",

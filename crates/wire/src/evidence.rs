@@ -55,7 +55,8 @@ pub fn decode_evidence(name: &Evidence, bytes: Bytes) -> Result<EvidenceBlob, Fi
     if bytes.len() as u64 != name.size_bytes || *blake3::hash(&bytes).as_bytes() != name.hash {
         return Err(at.refuse(format!("{} bytes that are not what their name says", bytes.len())));
     }
-    let message = v1::EvidenceBlob::decode(bytes).map_err(|e| at.refuse(format!("is no EvidenceBlob: {e}")))?;
+    let message =
+        v1::EvidenceBlob::decode(bytes).map_err(|e| at.refuse(format!("is no EvidenceBlob: {e}")))?;
     EvidenceBlob::from_wire(message, &at)
 }
 

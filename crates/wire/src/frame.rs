@@ -93,7 +93,9 @@ impl EncodedFrame {
                 DepthData::Raw16(m.depth)
             }
             Ok(v1::DepthEncoding::Coma) => DepthData::Coma(m.depth),
-            Ok(v1::DepthEncoding::Unspecified) => return Err(at.field("depth_encoding").refuse("is missing")),
+            Ok(v1::DepthEncoding::Unspecified) => {
+                return Err(at.field("depth_encoding").refuse("is missing"));
+            }
             Err(_) => {
                 return Err(at.field("depth_encoding").refuse(format!("{} is unknown", m.depth_encoding)));
             }

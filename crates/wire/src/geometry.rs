@@ -106,7 +106,8 @@ mod tests {
     fn a_single_precision_quaternion_is_normalised() {
         let m = pose();
         let single = |v: f64| f64::from(v as f32);
-        let rounded = v1::Pose { qx: single(m.qx), qy: single(m.qy), qz: single(m.qz), qw: single(m.qw), ..m };
+        let rounded =
+            v1::Pose { qx: single(m.qx), qy: single(m.qy), qz: single(m.qz), qw: single(m.qw), ..m };
         let read = Pose::from_wire(rounded, &At::ROOT).unwrap();
         assert!((read.rotation.quaternion().norm() - 1.0).abs() < 1e-15);
     }

@@ -4,7 +4,8 @@
 use crate::v1::{
     agent_client::AgentClient, agent_server::AgentServer, dpgo_client::DpgoClient, dpgo_server::DpgoServer,
     peer_client::PeerClient, peer_server::PeerServer, place_recognition_client::PlaceRecognitionClient,
-    place_recognition_server::PlaceRecognitionServer, viewer_client::ViewerClient, viewer_server::ViewerServer,
+    place_recognition_server::PlaceRecognitionServer, viewer_client::ViewerClient,
+    viewer_server::ViewerServer,
 };
 use tonic::body::Body;
 use tonic::client::GrpcService;

@@ -125,7 +125,9 @@ impl Wire for Payload {
                     full: at.field("full").required(m.full)?,
                 })
             }
-            Kind::LoopVerdict(m) => Payload::LoopVerdict(LoopVerdict::from_wire(m, &at.field("loop_verdict"))?),
+            Kind::LoopVerdict(m) => {
+                Payload::LoopVerdict(LoopVerdict::from_wire(m, &at.field("loop_verdict"))?)
+            }
             Kind::LoopWithdrawn(m) => {
                 let at = at.field("loop_withdrawn");
                 Payload::LoopWithdrawn(LoopWithdrawn {
@@ -150,11 +152,13 @@ impl Wire for LoopVerdict {
 
     fn to_wire(&self) -> v1::LoopVerdict {
         let outcome = match &self.outcome {
-            LoopOutcome::Accepted { from_from_to, information, numbers } => Outcome::Accepted(v1::LoopAccepted {
-                from_from_to: Some(from_from_to.to_wire()),
-                information: Some(information.to_wire()),
-                numbers: writable(numbers),
-            }),
+            LoopOutcome::Accepted { from_from_to, information, numbers } => {
+                Outcome::Accepted(v1::LoopAccepted {
+                    from_from_to: Some(from_from_to.to_wire()),
+                    information: Some(information.to_wire()),
+                    numbers: writable(numbers),
+                })
+            }
             LoopOutcome::Rejected { reason, message, numbers } => Outcome::Rejected(v1::LoopRejected {
                 reason: cut(reason, limits::NAME),
                 message: cut(message, limits::SENTENCE),
