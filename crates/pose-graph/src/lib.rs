@@ -1,1 +1,40 @@
-//! coma-pose-graph
+//! Pose graphs: from pairwise measurements between submaps to one map.
+//!
+//! Read in this order:
+//! * [`graph`]: nodes (submaps), edges (odometry and loops), and what makes an entry unusable.
+//! * [`residual`]: the error of one edge (eq. 11) and its Jacobians.
+//! * [`sparse`], [`solver`]: Levenberg-Marquardt over a sparse block Cholesky factorisation.
+//! * [`initialise`]: starts from a spanning tree or from the chordal relaxation.
+//! * [`gnc`], [`clique`], [`consistency`]: which loops to believe.
+//! * [`chain`], [`relative`]: which trajectories may join, and where they stand to each other (eq. 12).
+//! * [`global`]: the canonical solve of everything that is known (eq. 10); [`solution`] is its result.
+//! * [`covariance`]: how sure a pose is. [`g2o`]: files.
+//!
+//! Everything is `f64`, single-threaded, and a function of its arguments: the same entries in any order
+//! give the same bits.
+
+#![allow(
+    clippy::neg_cmp_op_on_partial_ord,
+    reason = "guards are positive, so that NaN falls on the safe side"
+)]
+
+pub mod chain;
+pub mod clique;
+pub mod consistency;
+pub mod covariance;
+pub mod g2o;
+pub mod global;
+pub mod gnc;
+pub mod graph;
+pub mod initialise;
+pub mod relative;
+pub mod residual;
+pub mod solution;
+pub mod solver;
+pub mod sparse;
+pub mod uncertain;
+
+pub use global::{GlobalSettings, solve};
+pub use graph::{Edge, EdgeKey, EdgeKind, GraphEntries, NodeInfo};
+pub use solution::{Component, Generation, LoopVerdict, LoopWeight, MapId, Solution};
+pub use solver::{Constraint, Problem, SolveError, Solved, SolverSettings};
