@@ -1,12 +1,20 @@
-//! Places: descriptors and the index.
+//! Recognising places: which two views may show the same one.
+//!
+//! * [`descriptor`]: what an image looks like in at most 512 bytes; only descriptors of one [`Space`] compare.
+//! * [`encoder`]: the trait behind which image encoders stand; [`builtin`] needs no download.
+//! * [`index`]: the most similar descriptors, by exact search.
+//! * [`candidates`]: pairs worth a geometric verification (temporal filter, thresholds, windows of anchors).
+//!
+//! No encoder is safe alone: thresholds favour recall, and registration decides.
 
-/// A place descriptor, quantised: `values[i] * scale`, of unit length before.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Descriptor {
-    /// Only descriptors of equal spaces are compared.
-    pub space: String,
-    /// What one step of a value means.
-    pub scale: f32,
-    /// `[dimension]`.
-    pub values: Vec<i8>,
-}
+pub mod builtin;
+pub mod candidates;
+pub mod descriptor;
+pub mod encoder;
+pub mod index;
+
+pub use builtin::Builtin;
+pub use candidates::{Candidate, Candidates, Settings};
+pub use descriptor::{Descriptor, DescriptorError, Space, similarity};
+pub use encoder::{EncodeError, Encoder, Thresholds};
+pub use index::{ExactIndex, Hit, Index};

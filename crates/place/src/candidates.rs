@@ -1,0 +1,259 @@
+//! Which pairs of anchors are worth a geometric verification (CoMA-SLAM, section 3.3): similar, not merely
+//! neighbours in time, and surrounded by anchors that are similar too.
+
+use crate::descriptor::{Descriptor, Space, similarity};
+use crate::encoder::Thresholds;
+use crate::index::{ExactIndex, Index};
+use coma_geometry::SubmapId;
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Settings of [`Candidates`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Within one life of one agent, anchors must be more than this many frames apart (the paper's tau_min).
+    pub min_gap_frames: u64,
+    /// Anchors to either side that belong to a window.
+    pub window: u32,
+    /// Most similar anchors that are looked at per query.
+    pub nearest: usize,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Settings { min_gap_frames: 20, window: 2, nearest: 20 }
+    }
+}
+
+/// A pair of anchors that may show one place.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Candidate {
+    /// The smaller id.
+    pub a: SubmapId,
+    /// The larger id.
+    pub b: SubmapId,
+    /// In which space they are similar.
+    pub space: Space,
+    /// Cosine of the two anchors.
+    pub similarity: f32,
+    /// Mean cosine over all pairs of the two windows.
+    pub window_similarity: f32,
+}
+
+/// All anchors known, and the pairs already proposed.
+#[derive(Clone, Debug)]
+pub struct Candidates {
+    settings: Settings,
+    thresholds: BTreeMap<Space, Thresholds>,
+    index: ExactIndex<SubmapId>,
+    anchors: BTreeMap<SubmapId, Anchor>,
+    tried: BTreeSet<(SubmapId, SubmapId)>,
+}
+
+#[derive(Clone, Debug)]
+struct Anchor {
+    frame: u64,
+    descriptors: BTreeMap<Space, Descriptor>,
+}
+
+impl Candidates {
+    /// Empty. Spaces without thresholds are stored but propose nothing.
+    pub fn new(settings: Settings, thresholds: BTreeMap<Space, Thresholds>) -> Self {
+        Candidates {
+            settings,
+            thresholds,
+            index: ExactIndex::default(),
+            anchors: BTreeMap::new(),
+            tried: BTreeSet::new(),
+        }
+    }
+
+    /// Number of anchors.
+    pub fn len(&self) -> usize {
+        self.anchors.len()
+    }
+
+    /// True without anchors.
+    pub fn is_empty(&self) -> bool {
+        self.anchors.is_empty()
+    }
+
+    /// Adds an anchor's descriptor; `frame` is the sequence number of its frame. An anchor may have one per space.
+    pub fn insert(&mut self, id: SubmapId, frame: u64, descriptor: Descriptor) {
+        self.index.insert(id.clone(), &descriptor);
+        let anchor = self.anchors.entry(id).or_insert(Anchor { frame, descriptors: BTreeMap::new() });
+        anchor.descriptors.insert(descriptor.space().clone(), descriptor);
+    }
+
+    /// Remembers a pair that was decided elsewhere: it will not be proposed.
+    pub fn mark_tried(&mut self, a: &SubmapId, b: &SubmapId) {
+        self.tried.insert(ordered(a, b));
+    }
+
+    /// The new candidates that `id` and its window take part in (a new anchor also completes the windows of
+    /// its neighbours), best first, equal ones by their ids. Each pair is proposed once, ever.
+    pub fn propose(&mut self, id: &SubmapId) -> Vec<Candidate> {
+        let mut best: BTreeMap<(SubmapId, SubmapId), (f32, Candidate)> = BTreeMap::new();
+        for member in self.window(id) {
+            let Some(anchor) = self.anchors.get(&member) else { continue };
+            for (space, descriptor) in &anchor.descriptors {
+                let Some(thresholds) = self.thresholds.get(space) else { continue };
+                let admit = |other: &SubmapId| {
+                    self.far_enough(&member, other) && !self.tried.contains(&ordered(&member, other))
+                };
+                for hit in self.index.query(descriptor, self.settings.nearest, &admit) {
+                    if !(hit.similarity > thresholds.theta_sim) {
+                        break;
+                    }
+                    let window_similarity = self.window_similarity(&member, &hit.key, space);
+                    if !(window_similarity > thresholds.theta_multi) {
+                        continue;
+                    }
+                    // Margins make spaces comparable.
+                    let margin = (hit.similarity - thresholds.theta_sim)
+                        + (window_similarity - thresholds.theta_multi);
+                    let pair = ordered(&member, &hit.key);
+                    let candidate = Candidate {
+                        a: pair.0.clone(),
+                        b: pair.1.clone(),
+                        space: space.clone(),
+                        similarity: hit.similarity,
+                        window_similarity,
+                    };
+                    let known = best.get(&pair).map_or(f32::NEG_INFINITY, |known| known.0);
+                    if margin > known {
+                        best.insert(pair, (margin, candidate));
+                    }
+                }
+            }
+        }
+        self.tried.extend(best.keys().cloned());
+        let mut ranked: Vec<(f32, Candidate)> = best.into_values().collect();
+        // Stable: equal margins keep the order of the ids.
+        ranked.sort_by(|x, y| y.0.total_cmp(&x.0));
+        ranked.into_iter().map(|(_, candidate)| candidate).collect()
+    }
+
+    /// Temporal filter. Frames of different agents or lives have no common count.
+    fn far_enough(&self, a: &SubmapId, b: &SubmapId) -> bool {
+        if a.agent != b.agent || a.epoch != b.epoch {
+            return true;
+        }
+        match (self.anchors.get(a), self.anchors.get(b)) {
+            (Some(x), Some(y)) => x.frame.abs_diff(y.frame) > self.settings.min_gap_frames,
+            _ => false,
+        }
+    }
+
+    /// The ids from `window` before to `window` after, of the same life.
+    fn window(&self, id: &SubmapId) -> Vec<SubmapId> {
+        let first = id.number.saturating_sub(self.settings.window);
+        let last = id.number.saturating_add(self.settings.window);
+        (first..=last).map(|number| SubmapId { number, ..id.clone() }).collect()
+    }
+
+    /// Mean similarity over all pairs of the two windows that have descriptors of the space.
+    fn window_similarity(&self, a: &SubmapId, b: &SubmapId, space: &Space) -> f32 {
+        let of = |id: &SubmapId| -> Vec<&Descriptor> {
+            self.window(id).iter().filter_map(|id| self.anchors.get(id)?.descriptors.get(space)).collect()
+        };
+        let (left, right) = (of(a), of(b));
+        let all: Vec<f32> = left.iter().flat_map(|x| right.iter().filter_map(|y| similarity(x, y))).collect();
+        if all.is_empty() { f32::NEG_INFINITY } else { all.iter().sum::<f32>() / all.len() as f32 }
+    }
+}
+
+fn ordered(a: &SubmapId, b: &SubmapId) -> (SubmapId, SubmapId) {
+    if a <= b { (a.clone(), b.clone()) } else { (b.clone(), a.clone()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use coma_geometry::{AgentId, Epoch};
+
+    fn space() -> Space {
+        Space::new("test/1").unwrap()
+    }
+
+    fn id(agent: &str, number: u32) -> SubmapId {
+        SubmapId { agent: AgentId::new(agent).unwrap(), epoch: Epoch(0), number }
+    }
+
+    /// Looks like place `p`, turned a little by `turn`.
+    fn at(p: usize, turn: f32) -> Descriptor {
+        let mut v = vec![0.0; 16];
+        v[p] = turn.cos();
+        v[15] = turn.sin();
+        Descriptor::from_f32(space(), &v).unwrap()
+    }
+
+    fn empty() -> Candidates {
+        let thresholds = Thresholds { theta_sim: 0.8, theta_multi: 0.3 };
+        Candidates::new(Settings::default(), BTreeMap::from([(space(), thresholds)]))
+    }
+
+    #[test]
+    fn neighbours_in_time_are_no_loop_but_another_agent_s_are() {
+        let mut known = empty();
+        known.insert(id("a", 0), 0, at(0, 0.0));
+        known.insert(id("a", 1), 20, at(0, 0.1));
+        assert!(known.propose(&id("a", 1)).is_empty());
+        known.insert(id("a", 2), 21, at(0, 0.1));
+        let found = known.propose(&id("a", 2));
+        assert_eq!(found.iter().map(|c| (c.a.number, c.b.number)).collect::<Vec<_>>(), vec![(0, 2)]);
+        known.insert(id("b", 0), 0, at(0, 0.1));
+        assert_eq!(known.propose(&id("b", 0)).len(), 3);
+    }
+
+    #[test]
+    fn a_lone_similar_anchor_among_strange_ones_is_turned_down() {
+        let mut known = empty();
+        for n in 0..5 {
+            // Agent b sees place 2 once, amid places that a never saw.
+            known.insert(id("a", n), n as u64 * 20, at(n as usize, 0.0));
+            known.insert(id("b", n), n as u64 * 20, at(if n == 2 { 2 } else { 8 + n as usize }, 0.0));
+        }
+        assert!(known.propose(&id("b", 2)).is_empty());
+        // Where the whole stretch is shared, it is proposed.
+        for n in 0..5 {
+            known.insert(id("c", n), n as u64 * 20, at(0, 0.1 * n as f32));
+            known.insert(id("d", n), n as u64 * 20, at(0, 0.1 * n as f32));
+        }
+        assert!(known.propose(&id("d", 2)).iter().any(|c| c.a == id("c", 2) && c.b == id("d", 2)));
+    }
+
+    #[test]
+    fn nothing_is_proposed_twice() {
+        let mut known = empty();
+        known.insert(id("a", 0), 0, at(0, 0.0));
+        known.insert(id("b", 0), 0, at(0, 0.0));
+        known.insert(id("c", 0), 0, at(0, 0.0));
+        known.mark_tried(&id("c", 0), &id("a", 0));
+        assert_eq!(known.propose(&id("a", 0)).len(), 1);
+        assert!(known.propose(&id("a", 0)).is_empty());
+        let rest = known.propose(&id("b", 0));
+        assert_eq!(rest.iter().map(|c| (&c.a, &c.b)).collect::<Vec<_>>(), vec![(&id("b", 0), &id("c", 0))]);
+    }
+
+    #[test]
+    fn the_best_candidate_comes_first_and_equal_ones_by_id() {
+        let mut known = empty();
+        known.insert(id("q", 0), 0, at(0, 0.0));
+        for (agent, turn) in [("c", 0.3), ("a", 0.3), ("b", 0.1)] {
+            known.insert(id(agent, 0), 0, at(0, turn));
+        }
+        let order: Vec<String> =
+            known.propose(&id("q", 0)).iter().map(|c| c.a.agent.as_str().to_owned()).collect();
+        assert_eq!(order, ["b", "a", "c"]);
+    }
+
+    #[test]
+    fn a_space_without_thresholds_proposes_nothing() {
+        let mut known = Candidates::new(Settings::default(), BTreeMap::new());
+        known.insert(id("a", 0), 0, at(0, 0.0));
+        known.insert(id("b", 0), 0, at(0, 0.0));
+        assert!(known.propose(&id("a", 0)).is_empty());
+    }
+}

@@ -1,0 +1,128 @@
+//! Every number that registration uses, with its unit and origin.
+
+use serde::{Deserialize, Serialize};
+
+/// One scale of coloured ICP.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Scale {
+    /// Side of the voxels that both clouds are averaged over, metres.
+    pub voxel_m: f32,
+    /// Points further apart than this never correspond, metres (widened to 3 sigma where depth is noisier).
+    pub max_correspondence_m: f32,
+    /// Most Gauss-Newton steps.
+    pub iterations: usize,
+}
+
+/// Settings of [`align`](crate::align()).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Settings {
+    /// Views are halved until they are at most this wide, pixels. Averaging also calms the depth.
+    pub working_width: usize,
+    /// Depth beyond this is left out, metres: a Kinect's error passes 2 cm at 3.2 m, 3 cm at 4 m.
+    pub max_depth_m: f32,
+    /// A pixel whose neighbour's depth differs by more than this share of its own lies on an edge and is left out.
+    pub depth_jump: f32,
+    /// Scales of coloured ICP, coarse to fine. The first one is also that of the features.
+    pub scales: Vec<Scale>,
+    /// Radius of a feature's neighbourhood in voxels of the first scale (Open3D's 5).
+    pub feature_radius_voxels: f32,
+    /// Most neighbours of a feature (Open3D's 100).
+    pub feature_neighbours: usize,
+    /// A match must be among this many nearest features in both directions; 1 = mutual nearest neighbours.
+    pub mutual_nearest: usize,
+    /// Fewer matches than this are not tried.
+    pub min_matches: usize,
+    /// RANSAC: two matches agree if their distances differ by at most this, metres.
+    pub edge_tolerance_m: f32,
+    /// RANSAC: and if the angle between their normals differs by at most this, radians.
+    pub normal_tolerance_rad: f32,
+    /// RANSAC: a match is an inlier within this distance, metres (1.5 voxels).
+    pub inlier_m: f32,
+    /// RANSAC: most samples; drawn in batches of 256.
+    pub samples: usize,
+    /// RANSAC: stop once a better sample was missed with less than this probability.
+    pub miss_probability: f64,
+    /// Fewer inlier matches than this are no hypothesis. Low: the views themselves decide afterwards.
+    pub min_inliers: usize,
+    /// Distinct hypotheses that are scored against the depth maps.
+    pub hypotheses: usize,
+    /// The best of these get a coarse ICP.
+    pub refined_hypotheses: usize,
+    /// The best of those get the full treatment.
+    pub verified_hypotheses: usize,
+    /// Share of the geometric term in coloured ICP (Park 2017: 0.968).
+    pub geometric_share: f64,
+    /// Most points of each cloud that look for a correspondence, per scale.
+    pub icp_points: usize,
+    /// Fewer correspondences than this at the end are a divergence.
+    pub min_correspondences: usize,
+    /// Least share of the points seen by both views that must have a correspondence.
+    pub min_fitness: f64,
+    /// Residuals within one block of this share of the image's width count as one sample (16 of 640 pixels).
+    pub blocks_across: u32,
+    /// Floor of the standard deviation of translation, metres.
+    pub floor_m: f64,
+    /// Floor of the standard deviation of rotation, radians (0.1 degree).
+    pub floor_rad: f64,
+    /// Least ratio of the Hessian's smallest to its largest eigenvalue, rotation measured at the points' radius.
+    pub min_eigenvalue_ratio: f64,
+    /// Below this ratio the variance along an eigenvector is inflated by `weak_ratio / ratio`.
+    pub weak_ratio: f64,
+    /// Two depths agree within this plus `depth_tolerance_sigmas` of both sensors' noise, metres.
+    pub depth_tolerance_m: f32,
+    /// See `depth_tolerance_m`.
+    pub depth_tolerance_sigmas: f32,
+    /// Least share of a view's points that the other must see at its own depth (the lesser direction).
+    pub min_overlap: f64,
+    /// Largest share of points, of those in agreement or conflict, that float in the other's free space.
+    pub max_conflict: f64,
+    /// Least zero-mean normalised correlation of the intensities of agreeing points.
+    pub min_correlation: f64,
+    /// Intensities whose standard deviation is below this (of 0..1) in either view say nothing; the correlation is then not used.
+    pub min_contrast: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Settings {
+            working_width: 320,
+            max_depth_m: 4.0,
+            depth_jump: 0.05,
+            scales: vec![
+                Scale { voxel_m: 0.05, max_correspondence_m: 0.15, iterations: 15 },
+                Scale { voxel_m: 0.025, max_correspondence_m: 0.07, iterations: 15 },
+                Scale { voxel_m: 0.0125, max_correspondence_m: 0.04, iterations: 12 },
+            ],
+            feature_radius_voxels: 5.0,
+            feature_neighbours: 100,
+            mutual_nearest: 1,
+            min_matches: 12,
+            edge_tolerance_m: 0.06,
+            normal_tolerance_rad: 0.5,
+            inlier_m: 0.075,
+            samples: 8192,
+            miss_probability: 1e-3,
+            min_inliers: 6,
+            hypotheses: 64,
+            refined_hypotheses: 6,
+            verified_hypotheses: 2,
+            geometric_share: 0.968,
+            icp_points: 4000,
+            min_correspondences: 200,
+            min_fitness: 0.3,
+            blocks_across: 40,
+            floor_m: 0.002,
+            floor_rad: 0.1_f64.to_radians(),
+            min_eigenvalue_ratio: 0.004,
+            weak_ratio: 0.05,
+            depth_tolerance_m: 0.02,
+            depth_tolerance_sigmas: 3.0,
+            min_overlap: 0.2,
+            max_conflict: 0.08,
+            min_correlation: 0.6,
+            min_contrast: 0.03,
+        }
+    }
+}
