@@ -1,0 +1,380 @@
+//! One agent's life: frames in, poses and submaps out.
+//!
+//! ```text
+//! frame -> guess -> frame-to-frame -> frame-to-model -> state -> grow -> optimise -> (submap full: next)
+//! ```
+//!
+//! Nothing here knows other agents: what is seen by several is the work of [`crate::loop_closure`], and
+//! its corrections move whole submaps, never a surfel (eq. 13). So the same frames give the same bits,
+//! whatever the network does.
+
+use crate::log::{OdometryEdge, SubmapOpened};
+use crate::mapping::submap::{ActiveSubmap, MappedFrame, MappingSettings};
+use crate::tracking::align::Brightness;
+use crate::tracking::view::TrackingView;
+use crate::tracking::{self, Reason, State, Tracked, TrackingSettings, model::Model};
+use coma_frame::RgbdFrame;
+use coma_geometry::{AgentId, Epoch, Matrix6, Pose, StampNs, SubmapId, se3};
+use coma_raster::RenderSettings;
+use coma_surfel::SurfelCloud;
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// Everything that can be set about one agent's tracking and mapping.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SlamSettings {
+    /// Where is the camera?
+    pub tracking: TrackingSettings,
+    /// What does it see?
+    pub mapping: MappingSettings,
+    /// How surfels become pictures.
+    pub render: RenderSettings,
+}
+
+/// The pose of one frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FramePose {
+    /// Position in the stream.
+    pub sequence: u64,
+    /// Sensor clock.
+    pub stamp: StampNs,
+    /// Which submap it belongs to.
+    pub submap: SubmapId,
+    /// Where it is in that submap; never changes.
+    pub submap_from_camera: Pose,
+    /// By odometry; never jumps within a chain.
+    pub agent_from_camera: Pose,
+    /// Of the camera in its submap, perturbed on the right.
+    pub covariance: Matrix6,
+    /// Takes the frame's brightness to the map's.
+    pub brightness: Brightness,
+}
+
+/// What happened.
+#[derive(Clone, Debug)]
+pub enum Event {
+    /// A submap began; its anchor is this frame.
+    SubmapOpened(SubmapOpened, Arc<RgbdFrame>),
+    /// Two submaps of one chain are tied by tracking.
+    Odometry(OdometryEdge),
+    /// A submap is finished.
+    SubmapClosed(SubmapId, Arc<SurfelCloud>),
+}
+
+/// What became of a frame.
+#[derive(Clone, Debug)]
+pub struct FrameOutcome {
+    /// How well the camera is known.
+    pub state: State,
+    /// Absent while the camera is lost.
+    pub pose: Option<FramePose>,
+    /// In order.
+    pub events: Vec<Event>,
+    /// Share of the pixels with depth that fit the map.
+    pub share: f64,
+    /// What mapping did.
+    pub mapped: MappedFrame,
+}
+
+/// What a frame is given.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameOptions {
+    /// Held-out frames are tracked, never mapped.
+    pub map: bool,
+    /// Optimiser steps that may be spent on this frame.
+    pub step_budget: u32,
+}
+
+impl Default for FrameOptions {
+    fn default() -> Self {
+        FrameOptions { map: true, step_budget: u32::MAX }
+    }
+}
+
+/// The tracker's memory of the frame before.
+struct Previous {
+    view: TrackingView,
+    agent_from_camera: Pose,
+    /// Motion of the last frame, in its own camera.
+    motion: Pose,
+}
+
+/// A closed submap that is still tracked against.
+#[derive(Clone, Debug)]
+pub struct Recent {
+    /// Its name.
+    pub id: SubmapId,
+    /// Its chain.
+    pub chain: u32,
+    /// Its surfels.
+    pub surfels: Arc<SurfelCloud>,
+    /// By odometry.
+    pub agent_from_submap: Pose,
+}
+
+/// Where an earlier life of this agent ended.
+#[derive(Clone, Debug)]
+pub struct Resume {
+    /// Number of the next submap.
+    pub next_submap: u32,
+    /// Frames that were taken.
+    pub frames: u64,
+    /// The last closed submap.
+    pub recent: Recent,
+    /// Of the last tracked frame.
+    pub agent_from_camera: Pose,
+}
+
+/// One agent's tracker and mapper.
+pub struct Agent {
+    id: AgentId,
+    epoch: Epoch,
+    settings: SlamSettings,
+    next_submap: u32,
+    next_chain: u32,
+    active: Option<ActiveSubmap>,
+    recent: Option<Recent>,
+    previous: Option<Previous>,
+    brightness: Brightness,
+    last_pose: Pose,
+    /// Frames in a row whose pose is a guess.
+    guesses: u32,
+    /// Frames taken, over all sessions.
+    frames: u64,
+}
+
+/// Guessed poses in a row before the camera is lost.
+const MAX_GUESSES: u32 = 1;
+
+impl Agent {
+    /// An agent that has seen nothing, or one that goes on where its earlier life ended: it first looks for
+    /// itself in its last submap.
+    pub fn new(id: AgentId, epoch: Epoch, resume: Option<Resume>, settings: SlamSettings) -> Self {
+        let (next_submap, next_chain, frames, recent, last_pose) = match resume {
+            Some(r) => (r.next_submap, r.recent.chain + 1, r.frames, Some(r.recent), r.agent_from_camera),
+            None => (0, 0, 0, None, Pose::identity()),
+        };
+        Agent {
+            id,
+            epoch,
+            settings,
+            next_submap,
+            next_chain,
+            active: None,
+            recent,
+            previous: None,
+            brightness: Brightness::default(),
+            last_pose,
+            guesses: 0,
+            frames,
+        }
+    }
+
+    /// The submap under work: id, revision and surfels.
+    pub fn active_submap(&self) -> Option<(&SubmapId, u64, &SurfelCloud)> {
+        self.active.as_ref().map(|a| (&a.id, a.revision, &a.surfels))
+    }
+
+    /// Takes a frame: tracks it, and maps it if allowed.
+    pub fn on_frame(&mut self, frame: Arc<RgbdFrame>, options: FrameOptions) -> FrameOutcome {
+        self.frames += 1;
+        let levels = self.settings.tracking.frame_to_frame.steps.len();
+        let share = frame.depth_coverage();
+        if !(share >= self.settings.tracking.min_depth_share) {
+            let needed = self.settings.tracking.min_depth_share * 100.0;
+            return self.lose(vec![Reason::LittleDepth { share: share * 100.0, needed }]);
+        }
+        let view = TrackingView::from_frame(&frame, levels);
+        match (&self.active, &self.recent) {
+            (None, None) => self.start_chain(frame, view, options),
+            (None, Some(_)) => match self.relocate(&view) {
+                Some(tracked) => self.keep(frame, view, tracked, options),
+                None => self.start_chain(frame, view, options),
+            },
+            _ => match self.track(&view) {
+                Ok(tracked) => self.keep(frame, view, tracked, options),
+                Err(reasons) => self.lose(reasons),
+            },
+        }
+    }
+
+    /// Looks for a camera that was lost in the submap where it was lost: a hand before the lens, or a restart.
+    fn relocate(&self, view: &TrackingView) -> Option<Tracked> {
+        let settings = &self.settings.tracking;
+        let found =
+            tracking::frame_to_model(&self.model(), view, &self.last_pose, self.brightness, settings).ok()?;
+        (found.share >= settings.relocate_share).then_some(found)
+    }
+
+    /// Closes the submap under work: the stream has ended.
+    pub fn finish(&mut self) -> Vec<Event> {
+        self.previous = None;
+        let events = self.close_active().into_iter().collect();
+        self.recent = None;
+        events
+    }
+
+    fn track(&self, view: &TrackingView) -> Result<Tracked, Vec<Reason>> {
+        let settings = &self.settings.tracking;
+        let guess = match &self.previous {
+            Some(previous) => {
+                let moved = tracking::frame_to_frame(&previous.view, view, &previous.motion, settings)
+                    .map_or(previous.motion, |found| found.reference_from_camera);
+                previous.agent_from_camera * moved
+            }
+            None => self.last_pose,
+        };
+        tracking::frame_to_model(&self.model(), view, &guess, self.brightness, settings)
+    }
+
+    fn model(&self) -> Model<'_> {
+        let recent = self.recent.iter().map(|r| (&*r.surfels, r.agent_from_submap));
+        let active = self.active.iter().map(|a| (&a.surfels, a.agent_from_submap));
+        Model { submaps: recent.chain(active).collect(), render: &self.settings.render }
+    }
+
+    /// A first submap, or the first after the camera was lost: its chain is tied to nothing yet.
+    fn start_chain(&mut self, frame: Arc<RgbdFrame>, view: TrackingView, options: FrameOptions) -> FrameOutcome {
+        let tracked = Tracked {
+            agent_from_camera: self.last_pose,
+            brightness: self.brightness,
+            covariance: Matrix6::zeros(),
+            share: 1.0,
+            map_at_once: false,
+            hits: 0,
+        };
+        self.previous = None;
+        self.recent = None;
+        let chain = self.next_chain;
+        self.next_chain += 1;
+        let (_, opened) = self.open_submap(&frame, chain, self.last_pose);
+        let mut outcome = self.keep(frame, view, tracked, FrameOptions { map: true, ..options });
+        outcome.events.insert(0, opened);
+        outcome
+    }
+
+    /// A tracked frame: its pose is kept, the map grows.
+    fn keep(
+        &mut self,
+        frame: Arc<RgbdFrame>,
+        view: TrackingView,
+        tracked: Tracked,
+        options: FrameOptions,
+    ) -> FrameOutcome {
+        self.guesses = 0;
+        self.brightness = tracked.brightness;
+        let mut events = Vec::new();
+        if options.map && self.active.as_ref().is_some_and(|a| a.is_full(&self.settings.mapping)) {
+            events.extend(self.close_active());
+        }
+        if self.active.is_none() {
+            events.extend(self.follow_recent(&frame, &tracked));
+        }
+        let mut mapped = MappedFrame::default();
+        let pose = self.active.as_mut().map(|active| {
+            let submap_from_camera = active.agent_from_submap.inv_mul(&tracked.agent_from_camera);
+            if options.map {
+                mapped = active.map(
+                    &frame,
+                    &submap_from_camera,
+                    tracked.brightness,
+                    tracked.map_at_once,
+                    options.step_budget,
+                    &self.settings.mapping,
+                    &self.settings.render,
+                );
+            }
+            FramePose {
+                sequence: frame.sequence,
+                stamp: frame.stamp,
+                submap: active.id.clone(),
+                submap_from_camera,
+                agent_from_camera: tracked.agent_from_camera,
+                covariance: tracked.covariance,
+                brightness: tracked.brightness,
+            }
+        });
+        let motion = match &self.previous {
+            Some(previous) => previous.agent_from_camera.inv_mul(&tracked.agent_from_camera),
+            None => Pose::identity(),
+        };
+        self.last_pose = tracked.agent_from_camera;
+        self.previous = Some(Previous { view, agent_from_camera: tracked.agent_from_camera, motion });
+        let degraded = self.settings.tracking.degraded_share;
+        let state = if tracked.share < degraded {
+            State::Degraded(vec![Reason::FewFit { share: tracked.share * 100.0, needed: degraded * 100.0 }])
+        } else {
+            State::Tracking
+        };
+        FrameOutcome { state, pose, events, share: tracked.share, mapped }
+    }
+
+    /// A frame that could not be tracked. The first of a row gets no pose but may still be found again from
+    /// the frame before; then the chain ends, and the next frame that shows something starts another.
+    fn lose(&mut self, reasons: Vec<Reason>) -> FrameOutcome {
+        let may_recover = self.guesses < MAX_GUESSES && self.active.is_some();
+        if may_recover {
+            self.guesses += 1;
+            if let Some(previous) = &mut self.previous {
+                // Whatever moved the camera, the motion before says little of it now.
+                previous.motion = Pose::identity();
+            }
+        }
+        let events = if may_recover { Vec::new() } else { self.close_active().into_iter().collect() };
+        if !may_recover {
+            self.previous = None;
+        }
+        let state = if may_recover { State::Degraded(reasons) } else { State::Lost(reasons) };
+        FrameOutcome { state, pose: None, events, share: 0.0, mapped: MappedFrame::default() }
+    }
+
+    /// Opens the submap after the last closed one, in its chain and tied to it.
+    fn follow_recent(&mut self, frame: &Arc<RgbdFrame>, tracked: &Tracked) -> Vec<Event> {
+        let Some(recent) = &self.recent else { return Vec::new() };
+        let (from, chain) = (recent.id.clone(), recent.chain);
+        let from_from_to = recent.agent_from_submap.inv_mul(&tracked.agent_from_camera);
+        let (to, opened) = self.open_submap(frame, chain, tracked.agent_from_camera);
+        let information = odometry_information(&from_from_to, &tracked.covariance);
+        vec![opened, Event::Odometry(OdometryEdge { from, to, from_from_to, information })]
+    }
+
+    fn open_submap(&mut self, frame: &Arc<RgbdFrame>, chain: u32, agent_from_submap: Pose) -> (SubmapId, Event) {
+        let id = SubmapId { agent: self.id.clone(), epoch: self.epoch, number: self.next_submap };
+        self.next_submap += 1;
+        self.active = Some(ActiveSubmap::open(id.clone(), chain, agent_from_submap));
+        let opened = SubmapOpened {
+            id: id.clone(),
+            anchor_frame: self.frames - 1,
+            anchor_stamp: frame.stamp,
+            agent_from_submap,
+            chain,
+        };
+        (id, Event::SubmapOpened(opened, frame.clone()))
+    }
+
+    /// Finishes the submap under work; it stays to be tracked against.
+    fn close_active(&mut self) -> Option<Event> {
+        let active = self.active.take()?;
+        let (id, chain, agent_from_submap) = (active.id.clone(), active.chain, active.agent_from_submap);
+        let surfels = Arc::new(active.close(&self.settings.mapping));
+        self.recent = Some(Recent { id: id.clone(), chain, surfels: surfels.clone(), agent_from_submap });
+        Some(Event::SubmapClosed(id, surfels))
+    }
+}
+
+/// Information of the motion across a submap: one frame's covariance for where the submap ends, and drift
+/// that grows with the way: 0.5 % of the distance, 0.5 % of the rotation and 1 mm and 0.05 degree per metre
+/// and radian across.
+fn odometry_information(from_from_to: &Pose, frame_covariance: &Matrix6) -> Matrix6 {
+    let (metres, radians) = se3::distance(&Pose::identity(), from_from_to);
+    let drift_m = 0.005 * metres + 0.002 * radians + 0.001;
+    let drift_rad = 0.005 * radians + 0.002 * metres + 0.05f64.to_radians();
+    let mut covariance = *frame_covariance;
+    for axis in 0..6 {
+        let drift = if axis < 3 { drift_m } else { drift_rad };
+        covariance[(axis, axis)] += drift * drift;
+    }
+    let information = covariance.try_inverse().unwrap_or_else(Matrix6::identity);
+    (information + information.transpose()) * 0.5
+}

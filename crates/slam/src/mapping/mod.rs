@@ -1,0 +1,6 @@
+//! What does the camera see? Surfels are seeded, grown, optimised and pruned.
+
+pub mod optimise;
+pub mod seed;
+pub mod ssim;
+pub mod submap;

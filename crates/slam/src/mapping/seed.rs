@@ -1,0 +1,125 @@
+//! New surfels from pixels: surface-fitting initialisation (eq. 6 to 8 of the CoMA-SLAM paper).
+
+use coma_frame::{Image, RgbdFrame, normals};
+use coma_geometry::Pose;
+use coma_surfel::Surfel;
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+
+/// How a pixel becomes a surfel.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SeedSettings {
+    /// Every n-th pixel in both directions becomes a surfel; the paper takes every one.
+    pub spacing_px: usize,
+    /// Standard deviation of a surfel in units of the spacing; the paper takes 1 (eq. 6). At 0.8 neighbours
+    /// still cover a surface to an opacity of 0.98 and blur it less.
+    pub scale_in_spacings: f32,
+    /// Opacity at birth.
+    pub opacity: f32,
+    /// A surfel on an inclined surface is stretched along the incline so that its picture keeps its size, at
+    /// most by this factor. 1 is the paper's eq. 6.
+    pub max_stretch: f32,
+}
+
+impl Default for SeedSettings {
+    fn default() -> Self {
+        SeedSettings { spacing_px: 2, scale_in_spacings: 0.8, opacity: 0.95, max_stretch: 3.0 }
+    }
+}
+
+/// Surfels for the pixels of the seed grid at which `wanted` holds, in the submap's frame. Pixels without
+/// depth or normal (a depth jump) make none.
+pub fn seed(
+    frame: &RgbdFrame,
+    submap_from_camera: &Pose,
+    settings: &SeedSettings,
+    wanted: impl Fn(usize, usize) -> bool,
+    color_at: impl Fn(usize, usize) -> [f32; 3],
+) -> Vec<Surfel> {
+    let normal = normals::normals_from_depth(&frame.depth_m, &frame.camera, 0.05, 2);
+    let spacing = settings.spacing_px.max(1);
+    let rotation = submap_from_camera.rotation.to_rotation_matrix().matrix().cast::<f32>();
+    let translation: Vector3<f32> = submap_from_camera.translation.vector.cast();
+    let mut out = Vec::new();
+    for y in (spacing / 2..frame.depth_m.height()).step_by(spacing) {
+        for x in (spacing / 2..frame.depth_m.width()).step_by(spacing) {
+            if !wanted(x, y) {
+                continue;
+            }
+            let Some((center, axes, scale)) = disc(frame, &normal, x, y, settings) else { continue };
+            let submap_axes = Rotation3::from_matrix_unchecked(rotation * axes);
+            let q = UnitQuaternion::from_rotation_matrix(&submap_axes);
+            out.push(Surfel {
+                center_m: (rotation * center + translation).into(),
+                rotation_wxyz: [q.w, q.i, q.j, q.k],
+                scale_m: scale,
+                opacity: settings.opacity,
+                color: color_at(x, y),
+            });
+        }
+    }
+    out
+}
+
+/// Centre, axes `(e1, e2, n)` and scales of a pixel's disc, in the camera.
+fn disc(
+    frame: &RgbdFrame,
+    normal: &Image<[f32; 3]>,
+    x: usize,
+    y: usize,
+    settings: &SeedSettings,
+) -> Option<(Vector3<f32>, Matrix3<f32>, [f32; 2])> {
+    let z = frame.depth_m[(x, y)];
+    let n = Vector3::from(normal[(x, y)]);
+    if !(z > 0.0) || n == Vector3::zeros() {
+        return None;
+    }
+    let ray: Vector3<f32> = frame.camera.ray(x as f64, y as f64).cast();
+    let view = ray.normalize();
+    // eq. (8): R = (e1, e2, n); e1 lies along the incline, so that only it needs stretching.
+    let cos = (-n.dot(&view)).clamp(0.0, 1.0);
+    let incline = view + n * cos;
+    let e1 = if incline.norm() > 1e-3 { incline.normalize() } else { n.cross(&Vector3::y()).normalize() };
+    let e2 = n.cross(&e1);
+    // eq. (6): s = (D / fx, D / fy), times the seed spacing.
+    let spread = settings.spacing_px.max(1) as f32 * settings.scale_in_spacings;
+    let base = spread * z * (0.5 / frame.camera.fx + 0.5 / frame.camera.fy) as f32;
+    let stretch = (1.0 / cos.max(1e-3)).clamp(1.0, settings.max_stretch.max(1.0));
+    Some((ray * z, Matrix3::from_columns(&[e1, e2, n]), [base * stretch, base]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use coma_frame::DepthNoise;
+    use coma_geometry::{Intrinsics, StampNs};
+
+    fn wall() -> RgbdFrame {
+        let camera = Intrinsics { width: 32, height: 24, fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5 };
+        let color = Image::filled(32, 24, [200u8, 100, 50]);
+        let depth = Image::filled(32, 24, 2.0f32);
+        RgbdFrame::new(0, StampNs(0), camera, DepthNoise::default(), color, depth).unwrap()
+    }
+
+    #[test]
+    fn surfels_lie_on_the_surface_and_face_the_camera() {
+        let frame = wall();
+        let pose = Pose::translation(1.0, 0.0, 0.0);
+        let surfels = seed(&frame, &pose, &SeedSettings::default(), |_, _| true, |_, _| [1.0, 0.5, 0.2]);
+        assert!(surfels.len() > 80);
+        for s in &surfels {
+            assert!((s.center_m[2] - 2.0).abs() < 1e-5);
+            let r = s.rotation();
+            assert!((r[(2, 2)] + 1.0).abs() < 1e-4, "normal {:?}", r.column(2));
+            assert!((r.determinant() - 1.0).abs() < 1e-4);
+        }
+    }
+
+    #[test]
+    fn scales_follow_equation_6() {
+        let settings = SeedSettings { spacing_px: 1, scale_in_spacings: 1.0, max_stretch: 1.0, ..Default::default() };
+        let surfels = seed(&wall(), &Pose::identity(), &settings, |x, y| (x, y) == (15, 11), |_, _| [0.0; 3]);
+        assert!((surfels[0].scale_m[0] - 2.0 / 30.0).abs() < 1e-6);
+    }
+}

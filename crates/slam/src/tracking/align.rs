@@ -1,0 +1,496 @@
+//! Dense RGB-D alignment by Gauss-Newton: projective point-to-plane and photometric residuals, robust
+//! weights, and a brightness gain and offset in the same system.
+//!
+//! Park, Zhou, Koltun, "Colored point cloud registration revisited" (2017) for the joint objective;
+//! Kerl, Sturm, Cremers, "Dense visual SLAM for RGB-D cameras" (2013) for weights by residual scale.
+
+use super::view::{Level, TrackingView};
+use coma_frame::DepthNoise;
+use coma_geometry::{Matrix6, Pose, se3};
+use nalgebra::{SMatrix, SVector, Vector3};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+type Matrix8 = SMatrix<f64, 8, 8>;
+type Vector8 = SVector<f64, 8>;
+
+/// How two pictures are aligned.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct AlignSettings {
+    /// Gauss-Newton steps per level, from coarse to fine; as many levels as numbers.
+    pub steps: Vec<usize>,
+    /// Only every n-th pixel of the finest level is used, in both directions.
+    pub finest_stride: usize,
+    /// Points farther apart than this many sigma(z) plus `max_distance_m` are no match.
+    pub max_distance_sigma: f32,
+    /// See `max_distance_sigma`; doubled at every coarser level.
+    pub max_distance_m: f32,
+    /// Weight of a photometric residual against a geometric one, each in units of its own scale.
+    pub photometric_weight: f32,
+    /// Smallest photometric scale, intensity 0..1: sensor noise and rounding.
+    pub min_photometric_scale: f32,
+    /// Smallest geometric scale, in units of sigma(z).
+    pub min_geometric_scale: f32,
+    /// Huber's constant, in units of the residuals' scale.
+    pub huber: f32,
+    /// How far the motion may be from the initial guess, metres (one standard deviation): holds directions
+    /// that the pictures say nothing of.
+    pub prior_m: f64,
+    /// See `prior_m`, radians.
+    pub prior_rad: f64,
+}
+
+impl Default for AlignSettings {
+    fn default() -> Self {
+        AlignSettings {
+            steps: vec![8, 6, 4],
+            finest_stride: 2,
+            max_distance_sigma: 8.0,
+            max_distance_m: 0.03,
+            photometric_weight: 0.5,
+            min_photometric_scale: 0.008,
+            min_geometric_scale: 0.1,
+            huber: 1.345,
+            prior_m: 0.05,
+            prior_rad: 0.05,
+        }
+    }
+}
+
+/// Brightness of the reference as a function of the picture's: `gain * intensity + offset`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Brightness {
+    /// Factor.
+    pub gain: f64,
+    /// Intensity 0..1.
+    pub offset: f64,
+}
+
+impl Default for Brightness {
+    fn default() -> Self {
+        Brightness { gain: 1.0, offset: 0.0 }
+    }
+}
+
+/// What an alignment found, on its finest level.
+#[derive(Clone, Debug)]
+pub struct Alignment {
+    /// The motion.
+    pub reference_from_camera: Pose,
+    /// Brightness change.
+    pub brightness: Brightness,
+    /// Gauss-Newton Hessian of the pose in units of the residuals' scales, perturbed on the right, of
+    /// correlated pixels: see [`Alignment::covariance`].
+    pub hessian: Matrix6,
+    /// Pixels with depth that were looked at.
+    pub pixels: usize,
+    /// Those that found a partner.
+    pub matched: usize,
+    /// Those whose point-to-plane residual is within 3 scales.
+    pub inliers: usize,
+    /// Robust scale of the geometric residuals, in units of sigma(z).
+    pub geometric_scale: f64,
+    /// Robust scale of the photometric residuals.
+    pub photometric_scale: f64,
+    /// Median size of the geometric residuals, metres.
+    pub median_distance_m: f64,
+}
+
+impl Alignment {
+    /// Share of the pixels with depth that fit.
+    pub fn inlier_share(&self) -> f64 {
+        self.inliers as f64 / self.pixels.max(1) as f64
+    }
+
+    /// Covariance of the motion, perturbed on the right: the inverse Hessian with one effective sample per
+    /// [`CORRELATED_PIXELS`] residuals, and a floor.
+    pub fn covariance(&self, floor_m: f64, floor_rad: f64) -> Matrix6 {
+        let mut information = self.hessian / CORRELATED_PIXELS;
+        for i in 0..6 {
+            information[(i, i)] += 1e-6;
+        }
+        let mut covariance = information.try_inverse().unwrap_or_else(|| Matrix6::identity() * 1e6);
+        for i in 0..6 {
+            let floor = if i < 3 { floor_m } else { floor_rad };
+            covariance[(i, i)] += floor * floor;
+        }
+        (covariance + covariance.transpose()) * 0.5
+    }
+}
+
+/// Aligns `view` to `reference`, from coarse to fine. `None` where too few pixels match to say anything.
+pub fn align(
+    reference: &TrackingView,
+    view: &TrackingView,
+    initial_reference_from_camera: &Pose,
+    initial_brightness: Brightness,
+    settings: &AlignSettings,
+) -> Option<Alignment> {
+    let mut pose = *initial_reference_from_camera;
+    let mut brightness = initial_brightness;
+    let mut scales = Scales { geometric: 2.0, photometric: 0.1 };
+    let levels = settings.steps.len().min(reference.levels.len()).min(view.levels.len());
+    let mut last = None;
+    for (i, steps) in settings.steps[settings.steps.len() - levels..].iter().enumerate() {
+        let level = levels - 1 - i;
+        let stride = if level == 0 { settings.finest_stride.max(1) } else { 1 };
+        let problem = Problem {
+            reference: &reference.levels[level],
+            view: &view.levels[level],
+            reference_noise: reference.noise,
+            noise: view.noise,
+            stride,
+            max_distance_m: settings.max_distance_m * (1 << level) as f32,
+            settings,
+        };
+        for step in 0..*steps {
+            let system = problem.linearise(&pose, brightness, scales);
+            if system.matched < 60 {
+                return None;
+            }
+            scales = system.scales(settings);
+            let (delta, brightness_delta) = system.solve(&pose, initial_reference_from_camera, brightness, settings)?;
+            // The system perturbs the reference's side: reference_from_camera <- exp(delta) * pose.
+            pose = se3::exp(&delta) * pose;
+            pose.rotation.renormalize();
+            brightness.gain = (brightness.gain + brightness_delta.gain).clamp(0.2, 5.0);
+            brightness.offset = (brightness.offset + brightness_delta.offset).clamp(-0.5, 0.5);
+            if !(delta.norm() < 10.0) {
+                return None;
+            }
+            if step > 0 && delta.norm() < 2e-5 {
+                break;
+            }
+        }
+        last = Some(problem);
+    }
+    let system = last?.linearise(&pose, brightness, scales);
+    let scales = system.scales(settings);
+    let to_right = se3::adjoint(&pose);
+    let left = system.hessian.fixed_view::<6, 6>(0, 0).into_owned();
+    Some(Alignment {
+        reference_from_camera: pose,
+        brightness,
+        hessian: to_right.transpose() * left * to_right,
+        pixels: system.pixels,
+        matched: system.matched,
+        inliers: system.inliers,
+        geometric_scale: scales.geometric,
+        photometric_scale: scales.photometric,
+        median_distance_m: system.median_distance_m(),
+    })
+}
+
+#[derive(Clone, Copy)]
+struct Scales {
+    geometric: f64,
+    photometric: f64,
+}
+
+struct Problem<'a> {
+    reference: &'a Level,
+    view: &'a Level,
+    reference_noise: DepthNoise,
+    noise: DepthNoise,
+    stride: usize,
+    max_distance_m: f32,
+    settings: &'a AlignSettings,
+}
+
+/// Bins of a histogram over sizes that span many powers of ten.
+const BINS: usize = 96;
+/// Bins in a factor of two.
+const BINS_PER_OCTAVE: f32 = 6.0;
+
+/// Counts sizes in logarithmic bins from `2^-12` on; its median is exact to a bin and needs no order.
+#[derive(Clone, Copy)]
+struct Histogram([u32; BINS]);
+
+impl Histogram {
+    #[inline]
+    fn add(&mut self, size: f32) {
+        let bin = ((size.max(1e-9).log2() + 12.0) * BINS_PER_OCTAVE) as i32;
+        self.0[bin.clamp(0, BINS as i32 - 1) as usize] += 1;
+    }
+
+    fn median(&self) -> f64 {
+        let half = self.0.iter().sum::<u32>() / 2;
+        let mut seen = 0;
+        for (bin, count) in self.0.iter().enumerate() {
+            if seen + count > half {
+                // Linear inside the bin.
+                let inside = (half - seen) as f32 / (*count).max(1) as f32;
+                return ((bin as f32 + inside) / BINS_PER_OCTAVE - 12.0).exp2() as f64;
+            }
+            seen += count;
+        }
+        0.0
+    }
+}
+
+/// Normal equations and counts; sums run over rows in a fixed order.
+#[derive(Clone)]
+struct System {
+    hessian: Matrix8,
+    gradient: Vector8,
+    pixels: usize,
+    matched: usize,
+    inliers: usize,
+    geometric: Histogram,
+    photometric: Histogram,
+    distance: Histogram,
+}
+
+/// Pixels that err together: residuals of one 16x16 block are about one effective sample; a stride thins it.
+pub const CORRELATED_PIXELS: f64 = 64.0;
+
+/// Rows that one task sums up: fixed, so that sums do not depend on the number of threads.
+const ROWS_PER_TASK: usize = 16;
+
+impl Problem<'_> {
+    fn linearise(&self, pose: &Pose, brightness: Brightness, scales: Scales) -> System {
+        let height = self.view.depth_m.height();
+        let rows: Vec<usize> = (0..height).step_by(self.stride).collect();
+        let parts: Vec<System> = rows
+            .par_chunks(ROWS_PER_TASK)
+            .map(|rows| {
+                let mut system = System::zero();
+                for y in rows {
+                    self.add_row(*y, pose, brightness, scales, &mut system);
+                }
+                system
+            })
+            .collect();
+        parts.into_iter().fold(System::zero(), System::plus)
+    }
+
+    fn add_row(&self, y: usize, pose: &Pose, brightness: Brightness, scales: Scales, out: &mut System) {
+        let camera = &self.view.camera;
+        let (inv_fx, inv_fy) = (1.0 / camera.fx as f32, 1.0 / camera.fy as f32);
+        let (cx, cy) = (camera.cx as f32, camera.cy as f32);
+        let target = self.reference;
+        let (rfx, rfy) = (target.camera.fx as f32, target.camera.fy as f32);
+        let (rcx, rcy) = (target.camera.cx as f32, target.camera.cy as f32);
+        let rotation = pose.rotation.to_rotation_matrix().matrix().cast::<f32>();
+        let translation: Vector3<f32> = pose.translation.vector.cast();
+        let (gain, offset) = (brightness.gain as f32, brightness.offset as f32);
+        let inv_geometric = 1.0 / scales.geometric as f32;
+        let inv_photometric = 1.0 / scales.photometric as f32;
+        let huber = self.settings.huber;
+        let photometric_weight = self.settings.photometric_weight * self.settings.photometric_weight;
+        let (max_u, max_v) = (target.depth_m.width() as f32 - 2.0, target.depth_m.height() as f32 - 2.0);
+        let mut sums = RowSums { pose: [0.0; 21], pose_gradient: [0.0; 6], full: [0.0; 36], full_gradient: [0.0; 8] };
+        let (depth, intensity) = (self.view.depth_m.row(y), self.view.intensity.row(y));
+        let normals = self.view.normal.row(y);
+        let ray_y = (y as f32 - cy) * inv_fy;
+        for x in (0..depth.len()).step_by(self.stride) {
+            let z = depth[x];
+            if !(z > 0.0) {
+                continue;
+            }
+            out.pixels += 1;
+            let point = Vector3::new((x as f32 - cx) * inv_fx * z, ray_y * z, z);
+            let p = rotation * point + translation;
+            if !(p.z > 0.05) {
+                continue;
+            }
+            let inv_z = 1.0 / p.z;
+            let (u, v) = (rfx * p.x * inv_z + rcx, rfy * p.y * inv_z + rcy);
+            if !(u >= 1.0 && v >= 1.0 && u < max_u && v < max_v) {
+                continue;
+            }
+            let nearest = ((u + 0.5) as usize, (v + 0.5) as usize);
+            let (z_ref, n) = (target.depth_m[nearest], target.normal[nearest]);
+            if !(z_ref > 0.0) || n == [0.0; 3] {
+                continue;
+            }
+            let n = Vector3::from(n);
+            let q = Vector3::new(
+                (nearest.0 as f32 - rcx) / rfx * z_ref,
+                (nearest.1 as f32 - rcy) / rfy * z_ref,
+                z_ref,
+            );
+            let own = self.noise.sigma_m(z);
+            let other = self.reference_noise.sigma_m(z_ref);
+            let sigma = (own * own + other * other).sqrt();
+            let limit = self.settings.max_distance_sigma * sigma + self.max_distance_m;
+            let gap = p - q;
+            if gap.norm_squared() > limit * limit {
+                continue;
+            }
+            let own_normal = Vector3::from(normals[x]);
+            if own_normal != Vector3::zeros() && (rotation * own_normal).dot(&n) < 0.5 {
+                continue;
+            }
+            out.matched += 1;
+
+            // Point to plane, in units of sigma(z).
+            let inv_sigma = 1.0 / sigma;
+            let distance = n.dot(&gap);
+            let r = distance * inv_sigma;
+            out.geometric.add(r.abs());
+            out.distance.add(distance.abs());
+            let scaled = r.abs() * inv_geometric;
+            out.inliers += (scaled < 3.0) as usize;
+            let weight = if scaled <= huber { 1.0 } else { huber / scaled } * inv_geometric * inv_geometric;
+            let moment = p.cross(&n);
+            let j = [n.x, n.y, n.z, moment.x, moment.y, moment.z].map(|v| v * inv_sigma);
+            sums.add_pose(&j, r, weight);
+
+            // Photometric: reference(warped) - (gain * own + offset).
+            let (iu, iv) = (u as usize, v as usize);
+            let (fu, fv) = (u - iu as f32, v - iv as f32);
+            let i = &target.intensity;
+            let top = i[(iu, iv)] * (1.0 - fu) + i[(iu + 1, iv)] * fu;
+            let bottom = i[(iu, iv + 1)] * (1.0 - fu) + i[(iu + 1, iv + 1)] * fu;
+            let r = top * (1.0 - fv) + bottom * fv - (gain * intensity[x] + offset);
+            out.photometric.add(r.abs());
+            let scaled = r.abs() * inv_photometric;
+            let huber_weight = if scaled <= huber { 1.0 } else { huber / scaled };
+            let weight = huber_weight * inv_photometric * inv_photometric * photometric_weight;
+            let g = target.gradient[nearest];
+            let (gu, gv) = (g[0] * rfx * inv_z, g[1] * rfy * inv_z);
+            let d = Vector3::new(gu, gv, -(gu * p.x + gv * p.y) * inv_z);
+            let moment = p.cross(&d);
+            sums.add_full(&[d.x, d.y, d.z, moment.x, moment.y, moment.z, -intensity[x], -1.0], r, weight);
+        }
+        sums.flush(out);
+    }
+}
+
+/// Sums over one row in single precision; rows are summed in double.
+struct RowSums {
+    /// Upper triangle of the 6x6 geometric part.
+    pose: [f32; 21],
+    pose_gradient: [f32; 6],
+    /// Upper triangle of the 8x8 photometric part.
+    full: [f32; 36],
+    full_gradient: [f32; 8],
+}
+
+impl RowSums {
+    #[inline]
+    fn add_pose(&mut self, j: &[f32; 6], r: f32, weight: f32) {
+        let mut k = 0;
+        for a in 0..6 {
+            let wa = weight * j[a];
+            self.pose_gradient[a] += wa * r;
+            for b in a..6 {
+                self.pose[k] += wa * j[b];
+                k += 1;
+            }
+        }
+    }
+
+    #[inline]
+    fn add_full(&mut self, j: &[f32; 8], r: f32, weight: f32) {
+        let mut k = 0;
+        for a in 0..8 {
+            let wa = weight * j[a];
+            self.full_gradient[a] += wa * r;
+            for b in a..8 {
+                self.full[k] += wa * j[b];
+                k += 1;
+            }
+        }
+    }
+
+    fn flush(&self, out: &mut System) {
+        fn triangle<const N: usize>(values: &[f32], gradient: &[f32; N], out: &mut System) {
+            let mut k = 0;
+            for a in 0..N {
+                out.gradient[a] += gradient[a] as f64;
+                for b in a..N {
+                    out.hessian[(a, b)] += values[k] as f64;
+                    if a != b {
+                        out.hessian[(b, a)] += values[k] as f64;
+                    }
+                    k += 1;
+                }
+            }
+        }
+        triangle(&self.pose, &self.pose_gradient, out);
+        triangle(&self.full, &self.full_gradient, out);
+    }
+}
+
+impl System {
+    fn zero() -> Self {
+        let empty = Histogram([0; BINS]);
+        System {
+            hessian: Matrix8::zeros(),
+            gradient: Vector8::zeros(),
+            pixels: 0,
+            matched: 0,
+            inliers: 0,
+            geometric: empty,
+            photometric: empty,
+            distance: empty,
+        }
+    }
+
+    fn plus(mut self, other: System) -> System {
+        self.hessian += other.hessian;
+        self.gradient += other.gradient;
+        self.pixels += other.pixels;
+        self.matched += other.matched;
+        self.inliers += other.inliers;
+        for (mine, theirs) in [
+            (&mut self.geometric, &other.geometric),
+            (&mut self.photometric, &other.photometric),
+            (&mut self.distance, &other.distance),
+        ] {
+            mine.0.iter_mut().zip(theirs.0).for_each(|(a, b)| *a += b);
+        }
+        self
+    }
+
+    /// 1.4826 x median: the standard deviation, if the residuals were normal.
+    fn scales(&self, settings: &AlignSettings) -> Scales {
+        Scales {
+            geometric: (1.4826 * self.geometric.median()).max(settings.min_geometric_scale as f64),
+            photometric: (1.4826 * self.photometric.median()).max(settings.min_photometric_scale as f64),
+        }
+    }
+
+    fn median_distance_m(&self) -> f64 {
+        self.distance.median()
+    }
+
+    fn solve(
+        &self,
+        pose: &Pose,
+        initial: &Pose,
+        brightness: Brightness,
+        settings: &AlignSettings,
+    ) -> Option<(coma_geometry::Tangent, Brightness)> {
+        let (mut hessian, mut gradient) = (self.hessian, self.gradient);
+        // The prior counts as CORRELATED_PIXELS residuals, as one effective sample of the pictures does.
+        let from_initial = se3::log(&(pose * initial.inverse()));
+        for axis in 0..6 {
+            let sigma = if axis < 3 { settings.prior_m } else { settings.prior_rad };
+            let weight = CORRELATED_PIXELS / (sigma * sigma);
+            hessian[(axis, axis)] += weight;
+            gradient[axis] += weight * from_initial[axis];
+        }
+        // Gain and offset are pulled to 1 and 0, weakly; the pose is only kept from singularity.
+        let pull = 1e-2 * self.matched as f64;
+        hessian[(6, 6)] += pull;
+        hessian[(7, 7)] += pull;
+        gradient[6] += pull * (brightness.gain - 1.0);
+        gradient[7] += pull * brightness.offset;
+        for i in 0..8 {
+            hessian[(i, i)] += 1e-9 * hessian[(i, i)] + 1e-6;
+        }
+        let step = hessian.cholesky()?.solve(&-gradient);
+        step.iter().all(|v| v.is_finite()).then(|| {
+            let pose = coma_geometry::Tangent::new(step[0], step[1], step[2], step[3], step[4], step[5]);
+            (pose, Brightness { gain: step[6], offset: step[7] })
+        })
+    }
+}
+
+#[cfg(test)]
+#[path = "align_tests.rs"]
+mod tests;

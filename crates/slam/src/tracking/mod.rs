@@ -1,0 +1,191 @@
+//! Where is the camera? A guess at constant velocity, then frame-to-frame, then frame-to-model.
+
+pub mod align;
+pub mod model;
+pub mod view;
+
+use align::{AlignSettings, Alignment, Brightness, align};
+use coma_geometry::{Matrix6, Pose, se3};
+use serde::{Deserialize, Serialize};
+use view::TrackingView;
+
+/// How the camera is tracked.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrackingSettings {
+    /// Frame against the frame before.
+    pub frame_to_frame: AlignSettings,
+    /// Frame against the rendered submaps.
+    pub frame_to_model: AlignSettings,
+    /// Renders and alignments against the model per frame.
+    pub model_rounds: u32,
+    /// The model is trusted where it is more opaque than this (eq. 4).
+    pub model_opacity: f32,
+    /// Below this share of fitting pixels the frame is mapped at once.
+    pub map_at_once_share: f64,
+    /// Below this share tracking is degraded.
+    pub degraded_share: f64,
+    /// Below this share the camera is lost.
+    pub lost_share: f64,
+    /// A lost camera is found again in its last submap if at least this share of its pixels fit.
+    pub relocate_share: f64,
+    /// A frame with less depth than this share of its pixels can't be tracked.
+    pub min_depth_share: f32,
+    /// A camera can't go farther between two frames, metres.
+    pub max_step_m: f64,
+    /// A camera can't turn farther between two frames, radians.
+    pub max_step_rad: f64,
+    /// Smallest standard deviation that a pose is given, metres.
+    pub floor_m: f64,
+    /// Smallest standard deviation that a pose is given, radians.
+    pub floor_rad: f64,
+}
+
+impl Default for TrackingSettings {
+    fn default() -> Self {
+        TrackingSettings {
+            frame_to_frame: AlignSettings::default(),
+            frame_to_model: AlignSettings {
+                steps: vec![4, 5, 5],
+                max_distance_m: 0.02,
+                prior_m: 0.02,
+                prior_rad: 0.02,
+                ..AlignSettings::default()
+            },
+            model_rounds: 1,
+            model_opacity: 0.9,
+            map_at_once_share: 0.4,
+            degraded_share: 0.25,
+            lost_share: 0.1,
+            relocate_share: 0.5,
+            min_depth_share: 0.05,
+            max_step_m: 0.5,
+            max_step_rad: 0.6,
+            floor_m: 0.002,
+            floor_rad: 0.1f64.to_radians(),
+        }
+    }
+}
+
+/// How well the camera is known.
+#[derive(Clone, Debug, PartialEq)]
+pub enum State {
+    /// As it should be.
+    Tracking,
+    /// The pose is a guess, or rests on little.
+    Degraded(Vec<Reason>),
+    /// No pose.
+    Lost(Vec<Reason>),
+}
+
+/// Why tracking is not as it should be.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum Reason {
+    /// Too little depth.
+    #[error("only {share:.1} % of the pixels have depth, {needed:.1} % are needed")]
+    LittleDepth {
+        /// Percent.
+        share: f32,
+        /// Percent.
+        needed: f32,
+    },
+    /// The frame could not be aligned at all.
+    #[error("the frame could not be aligned with {with}")]
+    NotAligned {
+        /// `the frame before` or `the map`.
+        with: &'static str,
+    },
+    /// Few pixels fit the map.
+    #[error("only {share:.1} % of the pixels fit the map, {needed:.1} % are needed")]
+    FewFit {
+        /// Percent.
+        share: f64,
+        /// Percent.
+        needed: f64,
+    },
+    /// The camera would have moved too far at once.
+    #[error("the camera would have moved {metres:.2} m and {degrees:.1} degrees in one frame")]
+    Jump {
+        /// Metres.
+        metres: f64,
+        /// Degrees.
+        degrees: f64,
+    },
+}
+
+/// What tracking made of a frame.
+#[derive(Clone, Debug)]
+pub struct Tracked {
+    /// In the frame of reference of the model that was given.
+    pub agent_from_camera: Pose,
+    /// Takes the frame's brightness to the model's.
+    pub brightness: Brightness,
+    /// Perturbed on the right (camera frame).
+    pub covariance: Matrix6,
+    /// Share of the pixels with depth that fit the model.
+    pub share: f64,
+    /// Little of the frame is in the map yet.
+    pub map_at_once: bool,
+    /// Blended hits of the model's renderings.
+    pub hits: u64,
+}
+
+/// Frame to frame: the motion since the frame before, started from the last motion; and as a second start
+/// from rest, where that fits better or the first failed.
+pub fn frame_to_frame(
+    previous: &TrackingView,
+    view: &TrackingView,
+    last_motion: &Pose,
+    settings: &TrackingSettings,
+) -> Option<Alignment> {
+    let with_velocity = align(previous, view, last_motion, Brightness::default(), &settings.frame_to_frame);
+    match with_velocity {
+        Some(found) if found.inlier_share() > settings.map_at_once_share => Some(found),
+        first => {
+            let from_rest = align(previous, view, &Pose::identity(), Brightness::default(), &settings.frame_to_frame);
+            [first, from_rest].into_iter().flatten().max_by(|a, b| a.inliers.cmp(&b.inliers))
+        }
+    }
+}
+
+/// Frame to model: renders `model` at the guess and aligns the frame with the picture.
+pub fn frame_to_model(
+    model: &model::Model<'_>,
+    view: &TrackingView,
+    guess_agent_from_camera: &Pose,
+    brightness: Brightness,
+    settings: &TrackingSettings,
+) -> Result<Tracked, Vec<Reason>> {
+    let mut pose = *guess_agent_from_camera;
+    let mut brightness = brightness;
+    let mut hits = 0;
+    let mut last = None;
+    for _ in 0..settings.model_rounds.max(1) {
+        let picture = model.picture(&pose, &view.levels[0].camera, view, settings);
+        hits += picture.hits;
+        let Some(found) = align(&picture.view, view, &Pose::identity(), brightness, &settings.frame_to_model) else {
+            return Err(vec![Reason::NotAligned { with: "the map" }]);
+        };
+        pose *= found.reference_from_camera;
+        pose.rotation.renormalize();
+        brightness = found.brightness;
+        last = Some(found);
+    }
+    let Some(found) = last else { return Err(vec![Reason::NotAligned { with: "the map" }]) };
+    let (metres, radians) = se3::distance(guess_agent_from_camera, &pose);
+    if !(metres <= settings.max_step_m && radians <= settings.max_step_rad) {
+        return Err(vec![Reason::Jump { metres, degrees: radians.to_degrees() }]);
+    }
+    let share = found.inlier_share();
+    if !(share >= settings.lost_share) {
+        return Err(vec![Reason::FewFit { share: share * 100.0, needed: settings.lost_share * 100.0 }]);
+    }
+    Ok(Tracked {
+        agent_from_camera: pose,
+        brightness,
+        covariance: found.covariance(settings.floor_m, settings.floor_rad),
+        share,
+        map_at_once: share < settings.map_at_once_share,
+        hits,
+    })
+}

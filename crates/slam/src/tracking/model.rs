@@ -1,0 +1,64 @@
+//! The map as a picture to align with.
+
+use super::TrackingSettings;
+use super::view::TrackingView;
+use coma_frame::Image;
+use coma_geometry::{Intrinsics, Pose};
+use coma_raster::{RenderSettings, Rendering, SubmapView};
+use coma_surfel::SurfelCloud;
+
+/// The submaps that are tracked against, in the agent's frame.
+pub struct Model<'a> {
+    /// Surfels, and where their submap lies.
+    pub submaps: Vec<(&'a SurfelCloud, Pose)>,
+    /// How they are rendered.
+    pub render: &'a RenderSettings,
+}
+
+/// A rendered model.
+pub struct ModelPicture {
+    /// To align with.
+    pub view: TrackingView,
+    /// Blended hits.
+    pub hits: u64,
+}
+
+impl Model<'_> {
+    /// Renders the model for a camera at `agent_from_camera`.
+    pub fn picture(
+        &self,
+        agent_from_camera: &Pose,
+        camera: &Intrinsics,
+        like: &TrackingView,
+        settings: &TrackingSettings,
+    ) -> ModelPicture {
+        let camera_from_agent = agent_from_camera.inverse();
+        let views: Vec<SubmapView> = self
+            .submaps
+            .iter()
+            .map(|(surfels, agent_from_submap)| SubmapView {
+                surfels,
+                camera_from_submap: camera_from_agent * agent_from_submap,
+            })
+            .collect();
+        let rendering = coma_raster::render(&views, camera, self.render, None);
+        let depth_m = trusted_depth(&rendering, like, settings);
+        let intensity = rendering.color.map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]);
+        let view = TrackingView::build(*camera, depth_m, intensity, like.noise, like.levels.len());
+        ModelPicture { view, hits: rendering.hits }
+    }
+}
+
+/// Expected depth where the blend is one surface (its spread is under 2 sigma(z)), otherwise the median
+/// depth; none where the model is not opaque.
+fn trusted_depth(rendering: &Rendering, like: &TrackingView, settings: &TrackingSettings) -> Image<f32> {
+    let mut out = rendering.depth_m.clone();
+    for (i, z) in out.pixels_mut().iter_mut().enumerate() {
+        if !(rendering.opacity.pixels()[i] > settings.model_opacity) {
+            *z = 0.0;
+        } else if !(rendering.depth_spread_m.pixels()[i] < 2.0 * like.noise.sigma_m(*z)) {
+            *z = rendering.median_depth_m.pixels()[i];
+        }
+    }
+    out
+}

@@ -1,0 +1,188 @@
+//! Anchors are described, shared, indexed and looked up.
+
+use crate::evidence;
+use crate::node::{AnchorJob, Node, Unfinished};
+use coma_frame::RgbdFrame;
+use coma_geometry::SubmapId;
+use coma_place::Descriptor;
+use coma_slam::log::{AnchorDescribed, Payload};
+use coma_slam::loop_closure::{Candidate, Pair};
+use coma_wire::v1::place_recognition_client::PlaceRecognitionClient;
+use coma_wire::{At, Wire, v1};
+use image::codecs::jpeg::JpegEncoder;
+use image::{ExtendedColorType, ImageEncoder};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+use tokio::sync::mpsc;
+use coma_runtime::Channel;
+use tracing::{debug, warn};
+
+/// How long to wait before a service that failed is asked again.
+const RETRY: Duration = Duration::from_millis(500);
+
+type Client = PlaceRecognitionClient<Channel>;
+
+/// Describes this agent's anchors as they come.
+pub async fn describe(node: Arc<Node>, mut anchors: mpsc::UnboundedReceiver<AnchorJob>, mut client: Client) {
+    while let Some(job) = anchors.recv().await {
+        if let Err(e) = describe_one(&node, &mut client, &job).await {
+            warn!(submap = %job.submap, error = %format!("{e:#}"), "an anchor could not be described: its place can't be recognised");
+        }
+        node.unfinished.fetch_sub(1, Ordering::SeqCst);
+        node.entries_changed();
+    }
+}
+
+async fn describe_one(node: &Node, client: &mut Client, job: &AnchorJob) -> anyhow::Result<()> {
+    let frame = job.frame.clone();
+    let (evidence, request) =
+        tokio::task::spawn_blocking(move || anyhow::Ok((evidence::from_frame(&frame)?, describe_request(&frame)?)))
+            .await??;
+    {
+        let mut knowledge = node.lock();
+        knowledge.journal.put_evidence(&evidence.coarse.1, true)?;
+        knowledge.journal.put_evidence(&evidence.full.1, true)?;
+    }
+    let mut tries = 0;
+    let response = loop {
+        match client.describe(request.clone()).await {
+            Ok(response) => break response.into_inner(),
+            Err(status) if tries < 20 => {
+                tries += 1;
+                debug!(%status, "place recognition did not describe an anchor yet");
+                tokio::time::sleep(RETRY).await;
+            }
+            Err(status) => return Err(status.into()),
+        }
+    };
+    let descriptors: Vec<Descriptor> = At::Root("descriptors").repeated(response.descriptors, 8)?;
+    let described = AnchorDescribed {
+        submap: job.submap.clone(),
+        descriptors,
+        coarse: evidence.coarse.0,
+        full: evidence.full.0,
+    };
+    node.lock().write(&Payload::AnchorDescribed(described))?;
+    Ok(())
+}
+
+fn describe_request(frame: &RgbdFrame) -> anyhow::Result<v1::DescribeRequest> {
+    let mut color = Vec::new();
+    JpegEncoder::new_with_quality(&mut color, 92).write_image(
+        frame.color.pixels().as_flattened(),
+        frame.camera.width,
+        frame.camera.height,
+        ExtendedColorType::Rgb8,
+    )?;
+    let depth = coma_depth_codec::encode(&frame.depth_m, &coma_depth_codec::Settings::default())?;
+    Ok(v1::DescribeRequest {
+        color_encoding: v1::ColorEncoding::Jpeg.into(),
+        color: color.into(),
+        depth: depth.into(),
+        camera: Some(frame.camera.to_wire()),
+    })
+}
+
+/// Keeps the index up with the logs, and looks up every new anchor, own or others'.
+pub async fn index(node: Arc<Node>, mut client: Client) {
+    loop {
+        let (inserts, queries) = {
+            let mut knowledge = node.lock();
+            let _unfinished = Unfinished::begin(&node);
+            (knowledge.closer.take_inserts(), knowledge.closer.take_queries())
+        };
+        let unfinished = Unfinished::begin(&node);
+        if inserts.is_empty() && queries.is_empty() {
+            drop(unfinished);
+            node.places_wake.notified().await;
+            continue;
+        }
+        if let Err(e) = insert(&node, &mut client, &inserts).await {
+            debug!(error = %format!("{e:#}"), "place recognition did not take anchors yet");
+            node.lock().closer.retry(inserts, queries);
+            tokio::time::sleep(RETRY).await;
+            continue;
+        }
+        for (i, submap) in queries.iter().enumerate() {
+            if let Err(e) = query(&node, &mut client, submap).await {
+                debug!(error = %format!("{e:#}"), "place recognition did not answer a query yet");
+                node.lock().closer.retry(Vec::new(), queries[i..].to_vec());
+                tokio::time::sleep(RETRY).await;
+                break;
+            }
+        }
+        node.verify_wake.notify_one();
+    }
+}
+
+async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyhow::Result<()> {
+    let (index, anchors) = {
+        let knowledge = node.lock();
+        let anchor = |id: &SubmapId| {
+            let facts = knowledge.closer.submap(id)?;
+            let anchor = facts.anchor.as_ref()?;
+            Some(v1::Anchor {
+                submap_id: Some(id.to_wire()),
+                anchor_frame: facts.opened.anchor_frame,
+                descriptors: anchor.descriptors.iter().map(Wire::to_wire).collect(),
+            })
+        };
+        (knowledge.agent.to_string(), submaps.iter().filter_map(anchor).collect::<Vec<_>>())
+    };
+    for chunk in anchors.chunks(256) {
+        let request = v1::InsertRequest { index: index.clone(), anchors: chunk.to_vec() };
+        client.insert(request).await?;
+    }
+    Ok(())
+}
+
+async fn query(node: &Node, client: &mut Client, submap: &SubmapId) -> anyhow::Result<()> {
+    let index = node.lock().agent.to_string();
+    let limit = node.config.loops.candidates_per_anchor;
+    let request = v1::QueryRequest { index, submap_id: Some(submap.to_wire()), limit };
+    let response = client.query(request).await?.into_inner();
+    let mut candidates = Vec::new();
+    let at = At::Root("candidates");
+    for (i, candidate) in response.candidates.into_iter().enumerate().take(limit as usize) {
+        let at = at.index(i);
+        let other: SubmapId = at.field("submap_id").required(candidate.submap_id)?;
+        let Some(pair) = Pair::new(submap, &other) else { continue };
+        candidates.push(Candidate {
+            pair,
+            similarity: candidate.similarity,
+            window_similarity: candidate.window_similarity,
+            space: candidate.space,
+        });
+    }
+    let now_s = node.now_s();
+    let mut knowledge = node.lock();
+    for agent in response.agents_without_common_space {
+        let text = format!("{agent} describes places in no space that this agent knows: no loops with it");
+        if !knowledge.warnings.contains(&text) {
+            knowledge.warnings.push(text);
+        }
+    }
+    knowledge.closer.on_candidates(candidates, now_s);
+    Ok(())
+}
+
+/// Asks which encoders run, and tells users.
+pub async fn encoders(node: Arc<Node>, mut client: Client) {
+    loop {
+        match client.get_encoders(v1::GetEncodersRequest {}).await {
+            Ok(response) => {
+                let response = response.into_inner();
+                let names: Vec<String> = response.encoders.into_iter().map(|e| format!("{} ({})", e.name, e.space)).collect();
+                let mut knowledge = node.lock();
+                knowledge.encoder = names.join(", ");
+                knowledge.warnings.extend(response.warnings);
+                return;
+            }
+            Err(status) => {
+                debug!(%status, "place recognition does not answer yet");
+                tokio::time::sleep(RETRY).await;
+            }
+        }
+    }
+}

@@ -1,0 +1,94 @@
+//! The graph is given to dpgo whenever it changed, and its corrections are taken over as a whole.
+
+use crate::convert;
+use crate::node::{Node, Unfinished};
+use coma_slam::log::{Payload, SolveDigest, VersionVector};
+use coma_wire::v1::dpgo_client::DpgoClient;
+use coma_wire::{At, Wire, v1};
+use std::sync::Arc;
+use std::time::Duration;
+use coma_runtime::Channel;
+use tracing::{debug, info, warn};
+
+/// Changes that come together are solved together.
+const GATHER: Duration = Duration::from_millis(200);
+/// How long to wait before a service that failed is asked again.
+const RETRY: Duration = Duration::from_millis(500);
+/// Entries in one call.
+const CHUNK: usize = 512;
+
+/// Solves after every change of the graph.
+pub async fn run(node: Arc<Node>, mut client: DpgoClient<Channel>) {
+    // What this dpgo has of the logs; forgotten when it restarts.
+    let mut have = VersionVector::new();
+    loop {
+        if !node.lock().closer.take_graph_changed() {
+            node.solve_wake.notified().await;
+            continue;
+        }
+        let _unfinished = Unfinished::begin(&node);
+        tokio::time::sleep(GATHER).await;
+        node.lock().closer.take_graph_changed();
+        loop {
+            match solve(&node, &mut client, &mut have).await {
+                Ok(()) => break,
+                Err(e) => {
+                    debug!(error = %format!("{e:#}"), "the graph could not be solved yet");
+                    have.clear();
+                    tokio::time::sleep(RETRY).await;
+                }
+            }
+        }
+    }
+}
+
+async fn solve(node: &Node, client: &mut DpgoClient<Channel>, have: &mut VersionVector) -> anyhow::Result<()> {
+    let (graph, entries, heads) = {
+        let knowledge = node.lock();
+        let missing: Vec<v1::Entry> = knowledge.replica.missing(have, usize::MAX).map(Wire::to_wire).collect();
+        (knowledge.agent.to_string(), missing, knowledge.replica.heads())
+    };
+    for chunk in entries.chunks(CHUNK) {
+        let request = v1::PutEntriesRequest { graph: graph.clone(), entries: chunk.to_vec() };
+        let response = client.put_entries(request).await?.into_inner();
+        *have = coma_wire::version_vector(response.have, &At::Root("have"))?;
+    }
+    let request = v1::SolveRequest { graph, at_least: Some(heads.to_wire()) };
+    let response = client.solve(request).await?.into_inner();
+    let at = At::Root("components");
+    let mut corrections = Vec::new();
+    for (i, component) in response.components.iter().enumerate() {
+        corrections.push(convert::correction(component.clone(), &at.index(i))?);
+    }
+    let mut knowledge = node.lock();
+    // Every agent says what its solver made of a cut, once, so that a difference is seen by all.
+    let own = knowledge.agent.clone();
+    let before = knowledge.corrections.components().to_vec();
+    let mut digests = Vec::new();
+    for c in &corrections {
+        let mine = c.map_from_submap.keys().any(|id| id.agent == own);
+        let shared = c.map_from_submap.keys().any(|id| id.agent != own);
+        let known = before.iter().any(|b| b.generation == c.generation);
+        if mine && shared && !known {
+            let g = c.generation.clone();
+            digests.push(SolveDigest { map_id: g.map_id, cut: g.cut, digest: g.digest });
+        }
+    }
+    let joined = corrections.len();
+    knowledge.corrections.replace(corrections);
+    for rejected in &response.rejected_entries {
+        warn!(key = ?rejected.key, message = %rejected.message, "an entry is not used in the graph");
+    }
+    knowledge.solved = response.clone();
+    for digest in digests {
+        if let Err(e) = knowledge.write(&Payload::SolveDigest(digest)) {
+            warn!(error = %format!("{e:#}"), "a digest could not be written");
+        }
+    }
+    drop(knowledge);
+    info!(components = joined, "graph solved");
+    for component in response.components {
+        node.publish(v1::watch_response::Event::Correction(component));
+    }
+    Ok(())
+}
