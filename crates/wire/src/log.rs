@@ -1,0 +1,88 @@
+//! Log entries and version vectors.
+
+use crate::field::{At, FieldError, Wire, limits};
+use crate::v1;
+use bytes::Bytes;
+use coma_geometry::{AgentId, Epoch};
+use coma_slam::log::{Entry, EntryKey, Hash, VersionVector};
+
+/// A blake3 hash: 32 bytes.
+pub fn hash(bytes: &[u8], at: &At<'_>) -> Result<Hash, FieldError> {
+    bytes.try_into().map_err(|_| at.refuse(format!("{} bytes, 32 are needed", bytes.len())))
+}
+
+/// Who holds a map's gauge, and in which life.
+pub fn map_id(message: v1::MapId, at: &At<'_>) -> Result<(AgentId, Epoch), FieldError> {
+    <(AgentId, Epoch)>::from_wire(message, at)
+}
+
+/// A version vector; absent means that nothing is known.
+pub fn version_vector(message: Option<v1::VersionVector>, at: &At<'_>) -> Result<VersionVector, FieldError> {
+    Ok(at.optional(message)?.unwrap_or_default())
+}
+
+impl Wire for (AgentId, Epoch) {
+    type Message = v1::MapId;
+
+    fn to_wire(&self) -> v1::MapId {
+        v1::MapId { agent_id: self.0.to_wire(), epoch: self.1.0 }
+    }
+
+    fn from_wire(m: v1::MapId, at: &At<'_>) -> Result<Self, FieldError> {
+        Ok((AgentId::from_wire(m.agent_id, &at.field("agent_id"))?, Epoch(m.epoch)))
+    }
+}
+
+impl Wire for VersionVector {
+    type Message = v1::VersionVector;
+
+    fn to_wire(&self) -> v1::VersionVector {
+        let head = |((agent, epoch), length): (&(AgentId, Epoch), &u64)| v1::LogHead {
+            agent_id: agent.to_wire(),
+            epoch: epoch.0,
+            length: *length,
+        };
+        v1::VersionVector { heads: self.iter().map(head).collect() }
+    }
+
+    fn from_wire(m: v1::VersionVector, at: &At<'_>) -> Result<Self, FieldError> {
+        let at = at.field("heads");
+        at.at_most(m.heads.len(), limits::LOGS, "logs")?;
+        let mut out = VersionVector::new();
+        for (i, head) in m.heads.into_iter().enumerate() {
+            let at = at.index(i);
+            let agent = AgentId::from_wire(head.agent_id, &at.field("agent_id"))?;
+            if out.insert((agent, Epoch(head.epoch)), head.length).is_some() {
+                return Err(at.refuse("names a log that was named before"));
+            }
+        }
+        Ok(out)
+    }
+}
+
+impl Wire for Entry {
+    type Message = v1::Entry;
+
+    fn to_wire(&self) -> v1::Entry {
+        v1::Entry {
+            key: Some(self.key.to_wire()),
+            previous_hash: self.previous_hash.map_or_else(Bytes::new, |h| Bytes::copy_from_slice(&h)),
+            payload: Bytes::copy_from_slice(&self.payload),
+            signature: Bytes::copy_from_slice(&self.signature),
+        }
+    }
+
+    /// The payload is not looked into: it may be of a kind that only newer agents know.
+    fn from_wire(m: v1::Entry, at: &At<'_>) -> Result<Self, FieldError> {
+        let key: EntryKey = at.field("key").required(m.key)?;
+        let previous = at.field("previous_hash");
+        let previous_hash = match (key.sequence, m.previous_hash.is_empty()) {
+            (0, true) => None,
+            (0, false) => return Err(previous.refuse("must be empty in sequence 0")),
+            _ => Some(hash(&m.previous_hash, &previous)?),
+        };
+        at.field("payload").at_most(m.payload.len(), limits::PAYLOAD, "bytes")?;
+        at.field("signature").at_most(m.signature.len(), limits::SIGNATURE, "bytes")?;
+        Ok(Entry { key, previous_hash, payload: m.payload.to_vec(), signature: m.signature.to_vec() })
+    }
+}
