@@ -64,7 +64,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let pool = pool.build()?;
     let mut rows = Vec::new();
     for source in source::open(&arguments.specs)? {
-        rows.push(pool.install(|| one(&source, &settings, arguments))?);
+        rows.push(pool.install(|| one(source, &settings, arguments))?);
     }
     if arguments.json {
         println!("{}", serde_json::to_string_pretty(&rows)?);
@@ -74,7 +74,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn one(source: &Source, settings: &SlamSettings, arguments: &Arguments) -> anyhow::Result<Row> {
+fn one(source: Source, settings: &SlamSettings, arguments: &Arguments) -> anyhow::Result<Row> {
     let sequence = &*source.sequence;
     let progress = crate::progress::frames(&source.agent, sequence.len() as u64);
     let mut agent = Agent::new(AgentId::new(&source.agent)?, Epoch(1), None, settings.clone());
