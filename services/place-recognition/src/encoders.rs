@@ -75,7 +75,8 @@ impl Encoders {
     /// What users should know: models that are not there, and models that failed on a picture.
     pub fn warnings(&self) -> Vec<String> {
         let failed = self.failed.lock().unwrap_or_else(PoisonError::into_inner);
-        let failed = failed.iter().map(|(name, reason)| format!("model {name} failed on a picture: {reason}"));
+        let failed =
+            failed.iter().map(|(name, reason)| format!("model {name} failed on a picture: {reason}"));
         self.refused.iter().cloned().chain(failed).collect()
     }
 
@@ -127,12 +128,13 @@ mod onnx {
     }
 
     pub fn open(manifest: &Path, config: &PlaceRecognitionConfig) -> Result<Model, String> {
-        let settings =
-            RuntimeSettings { library: config.onnx.library.clone(), threads: config.onnx.threads };
+        let settings = RuntimeSettings { library: config.onnx.library.clone(), threads: config.onnx.threads };
         let encoder = OnnxEncoder::open(manifest, &settings).map_err(|e| e.to_string())?;
         if encoder.dimension() > MAX_DIMENSION {
             let found = encoder.dimension();
-            return Err(format!("output.dimension is {found}, descriptors have at most {MAX_DIMENSION} values"));
+            return Err(format!(
+                "output.dimension is {found}, descriptors have at most {MAX_DIMENSION} values"
+            ));
         }
         let space = Space::new(&encoder.space()).map_err(|e| e.to_string())?;
         Ok(Model { space, encoder })
@@ -152,7 +154,11 @@ mod onnx {
             Thresholds { theta_sim, theta_multi }
         }
 
-        fn encode(&self, color: &Image<[u8; 3]>, _depth_m: Option<&Image<f32>>) -> Result<Vec<f32>, EncodeError> {
+        fn encode(
+            &self,
+            color: &Image<[u8; 3]>,
+            _depth_m: Option<&Image<f32>>,
+        ) -> Result<Vec<f32>, EncodeError> {
             self.encoder.encode(color).map_err(|e| EncodeError::Model(e.to_string()))
         }
     }

@@ -127,7 +127,11 @@ impl Indices {
             && !kept.contains_key(name)
             && let Some(oldest) = kept.iter().min_by_key(|(_, k)| k.last_used).map(|(name, _)| name.clone())
         {
-            warn!(dropped = oldest, max_indices = self.max_indices, "the least recently used index made room");
+            warn!(
+                dropped = oldest,
+                max_indices = self.max_indices,
+                "the least recently used index made room"
+            );
             kept.remove(&oldest);
         }
         *clock += 1;

@@ -21,7 +21,8 @@ impl Picture {
         let camera: Intrinsics = at.required(request.camera)?;
         if camera.pixels() > max_pixels {
             let Intrinsics { width, height, .. } = camera;
-            let message = format!("{width}x{height} pixels are over this service's max_pixels = {max_pixels}");
+            let message =
+                format!("{width}x{height} pixels are over this service's max_pixels = {max_pixels}");
             return Err(at.refuse(message));
         }
         let color = coma_wire::read_color(request.color_encoding, request.color, &camera, &At::ROOT)?;

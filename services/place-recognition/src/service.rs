@@ -67,7 +67,8 @@ fn anchor(message: v1::Anchor, at: &At<'_>) -> Result<Anchor, FieldError> {
     let mut spaces = BTreeSet::new();
     for (i, descriptor) in descriptors.iter().enumerate() {
         if !spaces.insert(descriptor.space()) {
-            let message = format!("{} was named before: an anchor has one descriptor per space", descriptor.space());
+            let message =
+                format!("{} was named before: an anchor has one descriptor per space", descriptor.space());
             return Err(at.index(i).field("space").refuse(message));
         }
     }
@@ -142,15 +143,13 @@ impl PlaceRecognition for PlaceService {
         Ok(Response::new(v1::InsertResponse { anchors_in_index: anchors_in_index as u64 }))
     }
 
-    async fn query(
-        &self,
-        request: Request<v1::QueryRequest>,
-    ) -> Result<Response<v1::QueryResponse>, Status> {
+    async fn query(&self, request: Request<v1::QueryRequest>) -> Result<Response<v1::QueryResponse>, Status> {
         let request = request.into_inner();
         let name = index_name(request.index)?;
         let submap: SubmapId = At::Root("submap_id").required(request.submap_id)?;
         if request.limit > MAX_CANDIDATES {
-            let message = format!("{} is over {MAX_CANDIDATES}; 0 asks for as many as there are", request.limit);
+            let message =
+                format!("{} is over {MAX_CANDIDATES}; 0 asks for as many as there are", request.limit);
             return Err(FieldError::new("limit", message).into());
         }
         let limit = if request.limit == 0 { MAX_CANDIDATES } else { request.limit } as usize;
