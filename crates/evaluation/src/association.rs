@@ -31,11 +31,7 @@ pub fn associate(estimate: &[StampNs], truth: &[StampNs], how: Association) -> V
     }
 }
 
-fn nearest(
-    short: &[StampNs],
-    long: &[StampNs],
-    tolerance_ns: u64,
-) -> impl Iterator<Item = (usize, usize)> {
+fn nearest(short: &[StampNs], long: &[StampNs], tolerance_ns: u64) -> impl Iterator<Item = (usize, usize)> {
     short.iter().enumerate().filter_map(move |(index, stamp)| {
         let after = long.partition_point(|other| other <= stamp);
         let distance_ns = |other: usize| long.get(other).map(|other| other.0.abs_diff(stamp.0));

@@ -23,13 +23,13 @@ pub use association::{Association, associate};
 pub use curve::{Curve, CurvePoint};
 pub use edges::{Edge, NormalisedErrors};
 pub use pictures::{
-    DepthL1, EQUAL_PICTURES_DB, FrameScore, PictureError, PictureScores, View, depth_l1, psnr_db, psnr_where_db,
-    score_frame,
+    DepthL1, EQUAL_PICTURES_DB, FrameScore, PictureError, PictureScores, View, depth_l1, psnr_db,
+    psnr_where_db, score_frame,
 };
 pub use report::*;
 pub use ssim::ssim;
 pub use stats::{Spread, percentile};
 pub use trajectory::{
-    AteUnscored, ComponentScore, Coverage, Evaluation, LEAST_COVERAGE, Rpe, RpeDelta, RunTrajectories, ScoreError,
-    Track, TrackScore, TrajectoryScores, evaluate, rpe,
+    AteUnscored, ComponentScore, Coverage, Evaluation, LEAST_COVERAGE, Rpe, RpeDelta, RunTrajectories,
+    ScoreError, Track, TrackScore, TrajectoryScores, evaluate, rpe,
 };

@@ -128,10 +128,7 @@ pub struct DepthL1 {
 ///
 /// # Errors
 /// Pictures of different sizes, or without pixels.
-pub fn depth_l1(
-    rendered_m: &Image<f32>,
-    recorded_m: &Image<f32>,
-) -> Result<Option<DepthL1>, PictureError> {
+pub fn depth_l1(rendered_m: &Image<f32>, recorded_m: &Image<f32>) -> Result<Option<DepthL1>, PictureError> {
     same_size("rendered depth", rendered_m, recorded_m)?;
     let both = rendered_m.pixels().iter().zip(recorded_m.pixels());
     let (mut sum_m, mut pixels) = (0.0f64, 0usize);
@@ -170,11 +167,7 @@ pub struct FrameScore {
 ///
 /// # Errors
 /// Pictures of different sizes, smaller than 11x11, or with a colour that isn't finite.
-pub fn score_frame(
-    rendered: View,
-    recorded: View,
-    lpips: Option<f64>,
-) -> Result<FrameScore, PictureError> {
+pub fn score_frame(rendered: View, recorded: View, lpips: Option<f64>) -> Result<FrameScore, PictureError> {
     let masked_db = psnr_where_db(rendered.color, recorded.color, recorded.depth_m)?;
     Ok(FrameScore {
         psnr_db: psnr_db(rendered.color, recorded.color)?.min(EQUAL_PICTURES_DB),
@@ -265,10 +258,7 @@ mod tests {
         assert!(psnr_db(&other, &grey(0.5)).unwrap_err().to_string().contains("rendered colour is 16x11"));
         let mut bad = grey(0.5);
         bad[(3, 2)][1] = f32::NAN;
-        assert_eq!(
-            psnr_db(&grey(0.5), &bad),
-            Err(PictureError::NotFinite { field: "recorded", x: 3, y: 2 })
-        );
+        assert_eq!(psnr_db(&grey(0.5), &bad), Err(PictureError::NotFinite { field: "recorded", x: 3, y: 2 }));
         let empty = Image::from_pixels(0, 0, Vec::new()).unwrap();
         assert!(psnr_db(&empty, &empty).is_err());
     }

@@ -35,7 +35,13 @@ pub fn ssim(a: &Image<[f32; 3]>, b: &Image<[f32; 3]>) -> Result<f64, PictureErro
 }
 
 /// Sum over the row of windows that begins at picture row `y`.
-fn row_sum(a: &Image<[f32; 3]>, b: &Image<[f32; 3]>, channel: usize, y: usize, kernel: &[f64; WINDOW]) -> f64 {
+fn row_sum(
+    a: &Image<[f32; 3]>,
+    b: &Image<[f32; 3]>,
+    channel: usize,
+    y: usize,
+    kernel: &[f64; WINDOW],
+) -> f64 {
     // Down the columns first: x, y, xx, yy, xy.
     let mut columns = vec![[0.0f64; 5]; a.width()];
     for (k, weight) in kernel.iter().enumerate() {
@@ -98,10 +104,7 @@ mod tests {
     #[test]
     fn pictures_smaller_than_the_window_are_refused() {
         let small = Image::filled(11, 10, [0.0; 3]);
-        assert_eq!(
-            ssim(&small, &small),
-            Err(PictureError::TooSmall { width: 11, height: 10, least: 11 })
-        );
+        assert_eq!(ssim(&small, &small), Err(PictureError::TooSmall { width: 11, height: 10, least: 11 }));
         let least = Image::filled(11, 11, [0.2; 3]);
         assert!((ssim(&least, &least).unwrap() - 1.0).abs() < 1e-12);
     }

@@ -117,7 +117,10 @@ impl Report {
     /// Everything written between agents, divided by the frames of all agents.
     pub fn bytes_per_frame(&self) -> Option<f64> {
         let frames = self.frames_seen();
-        self.traffic.as_ref().filter(|_| frames > 0).map(|traffic| traffic.between_agents() as f64 / frames as f64)
+        self.traffic
+            .as_ref()
+            .filter(|_| frames > 0)
+            .map(|traffic| traffic.between_agents() as f64 / frames as f64)
     }
 
     /// A stage's time over all frames of all agents, seconds; `None` if the stage or frames are missing.

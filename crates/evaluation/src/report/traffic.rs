@@ -79,7 +79,8 @@ impl Traffic {
             let sum = sums.entry((line.class, line.message_type)).or_default();
             *sum = (sum.0.saturating_add(line.bytes), sum.1.saturating_add(line.messages));
         }
-        let line = |((class, message_type), (bytes, messages))| SentBytes { class, message_type, bytes, messages };
+        let line =
+            |((class, message_type), (bytes, messages))| SentBytes { class, message_type, bytes, messages };
         Traffic(sums.into_iter().map(line).collect())
     }
 
@@ -110,15 +111,18 @@ mod tests {
     #[test]
     fn lines_of_several_agents_add_up() {
         use TrafficClass::*;
-        let traffic = Traffic::of([line(Local, "A", 7), line(Peer, "B", 1), line(Peer, "A", 2), line(Peer, "B", 3)]);
-        let kinds: Vec<_> = traffic.lines().iter().map(|l| (l.class, l.message_type.as_str(), l.bytes)).collect();
+        let traffic =
+            Traffic::of([line(Local, "A", 7), line(Peer, "B", 1), line(Peer, "A", 2), line(Peer, "B", 3)]);
+        let kinds: Vec<_> =
+            traffic.lines().iter().map(|l| (l.class, l.message_type.as_str(), l.bytes)).collect();
         assert_eq!(kinds, [(Peer, "A", 2), (Peer, "B", 4), (Local, "A", 7)]);
         assert_eq!(traffic.lines()[1].messages, 2);
     }
 
     #[test]
     fn only_peers_and_gossip_are_between_agents() {
-        let traffic = Traffic::of(TrafficClass::ALL.into_iter().zip([1, 10, 100, 1000]).map(|(c, b)| line(c, "A", b)));
+        let traffic =
+            Traffic::of(TrafficClass::ALL.into_iter().zip([1, 10, 100, 1000]).map(|(c, b)| line(c, "A", b)));
         assert_eq!((traffic.between_agents(), traffic.total(TrafficClass::Client)), (11, 1000));
     }
 

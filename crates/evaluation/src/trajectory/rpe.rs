@@ -80,7 +80,9 @@ mod tests {
         assert!((one.rotation_deg.max - 1.0).abs() < 1e-6, "{one:?}");
         let ten = rpe(&drifting(31), RpeDelta::consecutive(10)).unwrap();
         assert_eq!(ten.translation_m.count, 3);
-        assert!((ten.translation_m.mean - 0.01).abs() < 1e-9 && (ten.rotation_deg.median - 10.0).abs() < 1e-6);
+        assert!(
+            (ten.translation_m.mean - 0.01).abs() < 1e-9 && (ten.rotation_deg.median - 10.0).abs() < 1e-6
+        );
         assert_eq!(rpe(&drifting(31), RpeDelta::all_pairs(10)).unwrap().translation_m.count, 21);
     }
 
@@ -89,7 +91,8 @@ mod tests {
         let (a, b) =
             (se3::exp(&Tangent::new(1.0, 2.0, 3.0, 0.4, 2.0, -1.0)), Pose::translation(-5.0, 0.0, 1.0));
         let moved: Vec<(Pose, Pose)> = drifting(20).iter().map(|(e, t)| (a * e, b * t)).collect();
-        let (before, after) = (rpe(&drifting(20), RpeDelta::consecutive(2)), rpe(&moved, RpeDelta::consecutive(2)));
+        let (before, after) =
+            (rpe(&drifting(20), RpeDelta::consecutive(2)), rpe(&moved, RpeDelta::consecutive(2)));
         assert!((before.unwrap().translation_m.rmse - after.unwrap().translation_m.rmse).abs() < 1e-9);
     }
 

@@ -168,7 +168,8 @@ pub fn evaluate(run: &RunTrajectories) -> Result<Evaluation, ScoreError> {
     let mut matched: Vec<Matched> = tracks
         .into_iter()
         .map(|track| {
-            let stamps = |poses: &[(StampNs, Pose)]| poses.iter().map(|(stamp, _)| *stamp).collect::<Vec<_>>();
+            let stamps =
+                |poses: &[(StampNs, Pose)]| poses.iter().map(|(stamp, _)| *stamp).collect::<Vec<_>>();
             let pairs = associate(&stamps(&track.estimate), &stamps(&track.truth), run.association);
             Matched { track, pairs, truth_from_map: None }
         })
@@ -232,18 +233,13 @@ fn track_score(member: &Matched, deltas: &[super::RpeDelta]) -> (TrackScore, Cur
 }
 
 /// The least-squares alignment of matched poses, the error that is left, or why there is none.
-fn aligned(
-    poses: &[(Pose, Pose)],
-    knows_truth: bool,
-) -> (Option<Pose>, Option<Spread>, Option<AteUnscored>) {
+fn aligned(poses: &[(Pose, Pose)], knows_truth: bool) -> (Option<Pose>, Option<Spread>, Option<AteUnscored>) {
     let point = |pose: &Pose| Point3::from(pose.translation.vector);
     let (estimate, truth): (Vec<_>, Vec<_>) = poses.iter().map(|(e, t)| (point(e), point(t))).unzip();
     match rigid_alignment(&estimate, &truth) {
         Some(truth_from_map) => (Some(truth_from_map), ate(poses, &truth_from_map), None),
         None if !knows_truth => (None, None, Some(AteUnscored::NoTruth)),
-        None => {
-            (None, None, Some(AteUnscored::TooFewPairs { found: poses.len(), needed: LEAST_PAIRS }))
-        }
+        None => (None, None, Some(AteUnscored::TooFewPairs { found: poses.len(), needed: LEAST_PAIRS })),
     }
 }
 

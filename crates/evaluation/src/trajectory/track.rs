@@ -102,7 +102,11 @@ impl RunTrajectories {
             let of_agent = self.tracks.iter().filter(|other| other.agent == track.agent);
             let posed = of_agent.map(|other| other.estimate.len()).sum();
             if posed > track.frames_seen {
-                return Err(ScoreError::MorePosesThanFrames { agent: agent(), posed, seen: track.frames_seen });
+                return Err(ScoreError::MorePosesThanFrames {
+                    agent: agent(),
+                    posed,
+                    seen: track.frames_seen,
+                });
             }
         }
         Ok(())
