@@ -11,7 +11,7 @@ use std::process::Command;
 
 /// Prints `count rmse mean median max` of the absolute error, then of relative translation and rotation for each delta.
 const PYTHON: &str = r#"
-import sys
+import copy, sys
 from evo.core import metrics, sync
 from evo.core.units import Unit
 from evo.main_ape import ape
@@ -25,7 +25,8 @@ def show(result):
 show(ape(ref, est, metrics.PoseRelation.translation_part, align=True))
 for delta, every in [(1, False), (10, False), (10, True)]:
     for part in (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg):
-        show(rpe(ref, est, part, delta=delta, delta_unit=Unit.frames, all_pairs=every))
+        # It cuts its arguments down to the pairs.
+        show(rpe(copy.deepcopy(ref), copy.deepcopy(est), part, delta=delta, delta_unit=Unit.frames, all_pairs=every))
 "#;
 
 fn written(path: &Path, poses: &[Posed]) -> Vec<Posed> {

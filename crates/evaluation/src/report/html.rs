@@ -49,15 +49,17 @@ pub struct Picture {
 
 pub(super) fn page(report: &Report, plots: &Plots) -> String {
     let mut body = headline(report);
-    body += &charts(report, plots);
-    body += &pictures(plots);
-    for section in sections(report) {
+    let mut tables = sections(report).into_iter().map(|section| {
         let note = match section.note.as_str() {
             "" => String::new(),
             note => format!("<p class=\"note\">{}</p>\n", escape_html(note)),
         };
-        body += &format!("<section>\n<h2>{}</h2>\n{note}{}</section>\n", section.title, section.table.html());
-    }
+        format!("<section>\n<h2>{}</h2>\n{note}{}</section>\n", section.title, section.table.html())
+    });
+    let figures = tables.next().unwrap_or_default();
+    body += &charts(report, plots, &figures);
+    body += &pictures(plots);
+    body.extend(tables);
     if !report.run.settings.is_null() {
         let settings = serde_json::to_string_pretty(&report.run.settings).unwrap_or_default();
         body +=
@@ -133,31 +135,32 @@ fn headline(report: &Report) -> String {
     )
 }
 
-fn charts(report: &Report, plots: &Plots) -> String {
+/// Trajectories and the paper's figures to the left, the other plots to the right.
+fn charts(report: &Report, plots: &Plots, figures: &str) -> String {
     let has_points = plots.curves.iter().any(|curve| !curve.points.is_empty());
     let has_errors = plots.curves.iter().flat_map(|curve| &curve.points).any(|p| p.error_h_m.is_some());
     let figure = |title: &str, key: &str, svg: String| {
         format!("<figure>\n<figcaption>{title}</figcaption>\n{key}{svg}</figure>\n")
     };
-    let mut out = String::new();
-    // A plot that cannot be drawn is left out; the figures are in the tables.
+    let (mut left, mut right) = (String::new(), String::new());
+    // A plot that cannot be drawn is left out; its figures are in the tables.
     if has_points && let Ok(svg) = plots::trajectories(plots) {
-        out += &figure("Trajectories, from above", &key(plots, true), svg);
+        left += &figure("Trajectories, from above", &key(plots, true), svg);
     }
-    let mut beside = String::new();
+    left += figures;
     if has_errors && let Ok(svg) = plots::error_over_time(plots) {
-        beside += &figure("Error over time, protocol H", &key(plots, false), svg);
+        right += &figure("Error over time, protocol H", &key(plots, false), svg);
     }
     if let Ok(Some(svg)) = plots::bytes_by_message(report) {
-        beside += &figure("Bytes between agents, by message", "", svg);
+        right += &figure("Bytes between agents, by message", "", svg);
     }
     if let Ok(Some(svg)) = plots::times_by_stage(report) {
-        beside += &figure("Time by stage, all agents", "", svg);
+        right += &figure("Time by stage, all agents", "", svg);
     }
-    if out.is_empty() && beside.is_empty() {
-        return String::new();
+    match right.is_empty() {
+        true => left,
+        false => format!("<div class=\"charts\">\n<div>\n{left}</div>\n<div>\n{right}</div>\n</div>\n"),
     }
-    format!("<div class=\"charts\">\n<div>\n{out}</div>\n<div>\n{beside}</div>\n</div>\n")
 }
 
 /// Which colour is whose.

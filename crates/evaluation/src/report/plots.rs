@@ -159,20 +159,20 @@ pub(super) fn trajectories(plots: &Plots) -> Result<String, DrawError> {
     let seen = plots.curves.iter().flat_map(|curve| &curve.points).flat_map(|point| {
         std::iter::once(point.estimate_m).chain(point.truth_m).map(|point_m| above.see(&point_m))
     });
-    let (x_range, y_range) = equal_scale(seen, f64::from(width - 76) / f64::from(height - 62));
+    let (x_range, y_range) = equal_scale(seen, f64::from(width - 78) / f64::from(height - 64));
     drawn(width, height, |canvas| {
         let mut chart = ChartBuilder::on(canvas)
             .margin(10 * FINE)
-            .x_label_area_size(42 * FINE)
-            .y_label_area_size(56 * FINE)
+            .x_label_area_size(44 * FINE)
+            .y_label_area_size(58 * FINE)
             .build_cartesian_2d(x_range, y_range)?;
         chart
             .configure_mesh()
             .bold_line_style(line(Ink::Faint, FINE))
             .light_line_style(TRANSPARENT)
             .axis_style(line(Ink::Faint, FINE))
-            .label_style(text(12, Ink::Text))
-            .axis_desc_style(text(12, Ink::Text))
+            .label_style(text(16, Ink::Text))
+            .axis_desc_style(text(16, Ink::Text))
             .x_labels(8)
             .y_labels(7)
             .x_label_formatter(&|v| tick(*v))
@@ -246,8 +246,8 @@ pub(super) fn error_over_time(plots: &Plots) -> Result<String, DrawError> {
     drawn(640, 300, |canvas| {
         let mut chart = ChartBuilder::on(canvas)
             .margin(10 * FINE)
-            .x_label_area_size(42 * FINE)
-            .y_label_area_size(56 * FINE)
+            .x_label_area_size(44 * FINE)
+            .y_label_area_size(58 * FINE)
             .build_cartesian_2d(0.0..last_s, 0.0..worst_cm)?;
         chart
             .configure_mesh()
@@ -255,8 +255,8 @@ pub(super) fn error_over_time(plots: &Plots) -> Result<String, DrawError> {
             .bold_line_style(line(Ink::Faint, FINE))
             .light_line_style(TRANSPARENT)
             .axis_style(line(Ink::Faint, FINE))
-            .label_style(text(12, Ink::Text))
-            .axis_desc_style(text(12, Ink::Text))
+            .label_style(text(16, Ink::Text))
+            .axis_desc_style(text(16, Ink::Text))
             .x_labels(9)
             .y_labels(6)
             .x_label_formatter(&|v| tick(*v))
@@ -319,9 +319,9 @@ pub(super) fn times_by_stage(report: &Report) -> Result<Option<String>, DrawErro
 
 /// Horizontal bars with a name before and a label behind; `None` if there is none.
 fn bars(bars: &[Bar]) -> Result<Option<String>, DrawError> {
-    const ROW: i32 = 26;
-    const NAMES: i32 = 190;
-    const LABELS: i32 = 165;
+    const ROW: i32 = 30;
+    const NAMES: i32 = 205;
+    const LABELS: i32 = 215;
     const WIDTH: i32 = 640;
     /// More would not fit a page; the table has them all.
     const MOST: usize = 14;
@@ -333,11 +333,11 @@ fn bars(bars: &[Bar]) -> Result<Option<String>, DrawError> {
     let height = ROW * bars.len() as i32 + 12;
     let fine = FINE as i32;
     let svg = drawn(WIDTH as u32, height as u32, |canvas| {
-        let names = text(12, Ink::Text).pos(Pos::new(HPos::Right, VPos::Center));
-        let labels = text(12, Ink::Text).pos(Pos::new(HPos::Left, VPos::Center));
+        let names = text(16, Ink::Text).pos(Pos::new(HPos::Right, VPos::Center));
+        let labels = text(16, Ink::Text).pos(Pos::new(HPos::Left, VPos::Center));
         for (row, bar) in bars.iter().enumerate() {
             let middle = (6 + ROW * row as i32 + ROW / 2) * fine;
-            let half = 8 * fine;
+            let half = 9 * fine;
             let length = (bar.value / largest * f64::from(WIDTH - NAMES - LABELS)) as i32 * fine;
             let (left, right) = (NAMES * fine, NAMES * fine + length.max(fine));
             canvas.draw(&Text::new(shortened(&bar.name), (left - 8 * fine, middle), names.clone()))?;

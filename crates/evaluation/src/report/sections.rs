@@ -27,7 +27,7 @@ pub(super) fn markdown(report: &Report) -> String {
     text
 }
 
-/// All sections that have something to say; the first two always do.
+/// All sections that have something to say; the first always does.
 pub(super) fn sections(report: &Report) -> Vec<Section> {
     let mut all = vec![figures(report)];
     if let Some(scores) = &report.trajectories {
@@ -232,7 +232,7 @@ fn pictures(report: &Report) -> Section {
             number(Some(scores.ssim), 4),
             number(scores.lpips, 4),
             number(cm(scores.depth_l1_m), 2),
-            scores.depth_pixels.to_string(),
+            grouped(scores.depth_pixels),
         ]);
     };
     row("held out (protocol H)", report.pictures.held_out);
@@ -245,7 +245,7 @@ fn map(report: &Report) -> Section {
     if let Some(map) = report.map {
         let per_surfel = (map.surfels > 0).then(|| map.bytes as f64 / map.surfels as f64);
         let per_surfel = per_surfel.map_or("-".into(), |bytes| number(Some(bytes), 1));
-        table.push([map.submaps.to_string(), map.surfels.to_string(), bytes(map.bytes), per_surfel]);
+        table.push([map.submaps.to_string(), grouped(map.surfels), bytes(map.bytes), per_surfel]);
     }
     Section { title: "Map", note: String::new(), table }
 }
@@ -383,6 +383,14 @@ fn run(report: &Report) -> Section {
     Section { title: "Run", note: String::new(), table }
 }
 
+/// With a narrow space between thousands.
+fn grouped(count: usize) -> String {
+    let digits = count.to_string();
+    let groups: Vec<&str> =
+        digits.as_bytes().rchunks(3).rev().filter_map(|g| std::str::from_utf8(g).ok()).collect();
+    groups.join("\u{202f}")
+}
+
 /// Frames, then RMSE, mean, median and maximum in centimetres.
 fn spread(ate_m: Option<crate::Spread>) -> [String; 5] {
     let frames = ate_m.map_or(0, |ate| ate.count).to_string();
@@ -406,7 +414,34 @@ pub(super) fn percent(coverage: Coverage) -> String {
 pub(super) fn bytes(count: u64) -> String {
     match count {
         0..=9_999 => format!("{count} B"),
-        10_000..=9_999_999 => format!("{:.1} kB", count as f64 * 1e-3),
+        10_000..=999_949 => format!("{:.1} kB", count as f64 * 1e-3),
         _ => format!("{:.1} MB", count as f64 * 1e-6),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_coverage_is_never_rounded_up_to_enough() {
+        let of = |frames_posed, frames_seen| percent(Coverage { frames_posed, frames_seen });
+        assert_eq!(
+            (of(9796, 10_000), of(98, 100), of(1, 1)),
+            ("97.9 %".into(), "98.0 %".into(), "100.0 %".into())
+        );
+        assert_eq!(of(0, 0), "-");
+    }
+
+    #[test]
+    fn counts_are_easy_to_read() {
+        assert_eq!(
+            [0, 999, 1000, 1_234_567].map(grouped),
+            ["0", "999", "1\u{202f}000", "1\u{202f}234\u{202f}567"]
+        );
+        assert_eq!(
+            [812, 98_311, 999_949, 999_950, 9_896_280].map(bytes),
+            ["812 B", "98.3 kB", "999.9 kB", "1.0 MB", "9.9 MB"]
+        );
     }
 }
