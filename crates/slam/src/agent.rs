@@ -92,6 +92,17 @@ impl Default for FrameOptions {
     }
 }
 
+/// What the first half of a frame's way found.
+#[derive(Clone, Debug)]
+pub enum Located {
+    /// There is no map to be found in: a chain begins here.
+    Nowhere(TrackingView),
+    /// Found in the map.
+    Tracked(TrackingView, Tracked),
+    /// Not found, and why.
+    Lost(Vec<Reason>),
+}
+
 /// The tracker's memory of the frame before.
 struct Previous {
     view: TrackingView,
@@ -178,24 +189,39 @@ impl Agent {
 
     /// Takes a frame: tracks it, and maps it if allowed.
     pub fn on_frame(&mut self, frame: Arc<RgbdFrame>, options: FrameOptions) -> FrameOutcome {
-        self.frames += 1;
+        let located = self.locate(&frame);
+        self.take(frame, located, options)
+    }
+
+    /// The first half of [`Agent::on_frame`]: where is the camera? Changes nothing.
+    pub fn locate(&self, frame: &RgbdFrame) -> Located {
         let levels = self.settings.tracking.frame_to_frame.steps.len();
         let share = frame.depth_coverage();
         if !(share >= self.settings.tracking.min_depth_share) {
             let needed = self.settings.tracking.min_depth_share * 100.0;
-            return self.lose(vec![Reason::LittleDepth { share: share * 100.0, needed }]);
+            return Located::Lost(vec![Reason::LittleDepth { share: share * 100.0, needed }]);
         }
-        let view = TrackingView::from_frame(&frame, levels);
+        let view = TrackingView::from_frame(frame, levels);
         match (&self.active, &self.recent) {
-            (None, None) => self.start_chain(frame, view, options),
+            (None, None) => Located::Nowhere(view),
             (None, Some(_)) => match self.relocate(&view) {
-                Some(tracked) => self.keep(frame, view, tracked, options),
-                None => self.start_chain(frame, view, options),
+                Some(tracked) => Located::Tracked(view, tracked),
+                None => Located::Nowhere(view),
             },
             _ => match self.track(&view) {
-                Ok(tracked) => self.keep(frame, view, tracked, options),
-                Err(reasons) => self.lose(reasons),
+                Ok(tracked) => Located::Tracked(view, tracked),
+                Err(reasons) => Located::Lost(reasons),
             },
+        }
+    }
+
+    /// The second half: the frame's pose is kept, and the map grows. `located` must be of this frame.
+    pub fn take(&mut self, frame: Arc<RgbdFrame>, located: Located, options: FrameOptions) -> FrameOutcome {
+        self.frames += 1;
+        match located {
+            Located::Nowhere(view) => self.start_chain(frame, view, options),
+            Located::Tracked(view, tracked) => self.keep(frame, view, tracked, options),
+            Located::Lost(reasons) => self.lose(reasons),
         }
     }
 

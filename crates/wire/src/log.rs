@@ -5,6 +5,7 @@ use crate::v1;
 use bytes::Bytes;
 use coma_geometry::{AgentId, Epoch};
 use coma_slam::log::{Entry, EntryKey, Hash, VersionVector};
+use prost::Message;
 
 /// A blake3 hash: 32 bytes.
 pub fn hash(bytes: &[u8], at: &At<'_>) -> Result<Hash, FieldError> {
@@ -85,4 +86,16 @@ impl Wire for Entry {
         at.field("signature").at_most(m.signature.len(), limits::SIGNATURE, "bytes")?;
         Ok(Entry { key, previous_hash, payload: m.payload.to_vec(), signature: m.signature.to_vec() })
     }
+}
+
+/// An entry as it is kept on disk: its message, encoded.
+pub fn entry_to_bytes(entry: &Entry) -> Vec<u8> {
+    entry.to_wire().encode_to_vec()
+}
+
+/// Reads an entry that was kept on disk.
+pub fn entry_from_bytes(bytes: &[u8]) -> Result<Entry, FieldError> {
+    let at = At::Root("entry");
+    let message = v1::Entry::decode(bytes).map_err(|e| at.refuse(format!("cannot be decoded: {e}")))?;
+    Entry::from_wire(message, &at)
 }

@@ -77,7 +77,7 @@ impl Journal {
         let blobs = Blobs::open(folder.join("blobs"), BlobSettings::default())?;
         let mut notes = Vec::new();
         for (name, log) in [("log", &entries), ("checkpoints", &checkpoints)] {
-            let cut = log.recovery().cut_bytes;
+            let cut = log.recovery().torn_bytes;
             if cut > 0 {
                 notes.push(format!("{name}: {cut} bytes of an unfinished last record were cut off"));
             }
