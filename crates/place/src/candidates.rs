@@ -57,6 +57,9 @@ struct Anchor {
     descriptors: BTreeMap<Space, Descriptor>,
 }
 
+/// Pairs with their margins over the thresholds.
+type Rated = BTreeMap<(SubmapId, SubmapId), (f32, Candidate)>;
+
 impl Candidates {
     /// Empty. Spaces without thresholds are stored but propose nothing.
     pub fn new(settings: Settings, thresholds: BTreeMap<Space, Thresholds>) -> Self {
@@ -91,48 +94,66 @@ impl Candidates {
         self.tried.insert(ordered(a, b));
     }
 
+    /// True if the anchor is known.
+    pub fn contains(&self, id: &SubmapId) -> bool {
+        self.anchors.contains_key(id)
+    }
+
+    /// The spaces of an anchor's descriptors; none for an unknown anchor.
+    pub fn spaces(&self, id: &SubmapId) -> impl Iterator<Item = &Space> + '_ {
+        self.anchors.get(id).into_iter().flat_map(|anchor| anchor.descriptors.keys())
+    }
+
     /// The new candidates that `id` and its window take part in (a new anchor also completes the windows of
     /// its neighbours), best first, equal ones by their ids. Each pair is proposed once, ever.
     pub fn propose(&mut self, id: &SubmapId) -> Vec<Candidate> {
-        let mut best: BTreeMap<(SubmapId, SubmapId), (f32, Candidate)> = BTreeMap::new();
+        let mut rated = Rated::new();
         for member in self.window(id) {
-            let Some(anchor) = self.anchors.get(&member) else { continue };
-            for (space, descriptor) in &anchor.descriptors {
-                let Some(thresholds) = self.thresholds.get(space) else { continue };
-                let admit = |other: &SubmapId| {
-                    self.far_enough(&member, other) && !self.tried.contains(&ordered(&member, other))
+            self.rate(&member, &|other| !self.tried.contains(&ordered(&member, other)), &mut rated);
+        }
+        self.tried.extend(rated.keys().cloned());
+        ranked(rated)
+    }
+
+    /// The candidates that `id` itself takes part in, best first, equal ones by their ids. Nothing is
+    /// remembered: pairs that were proposed or decided are among them, and asking again gives the same answer.
+    pub fn of(&self, id: &SubmapId) -> Vec<Candidate> {
+        let mut rated = Rated::new();
+        self.rate(id, &|_| true, &mut rated);
+        ranked(rated)
+    }
+
+    /// Rates the anchors that are similar to `member` and admitted; of one pair the best space counts.
+    fn rate(&self, member: &SubmapId, admit: &(dyn Fn(&SubmapId) -> bool + Sync), rated: &mut Rated) {
+        let Some(anchor) = self.anchors.get(member) else { return };
+        for (space, descriptor) in &anchor.descriptors {
+            let Some(thresholds) = self.thresholds.get(space) else { continue };
+            let admit = |other: &SubmapId| self.far_enough(member, other) && admit(other);
+            for hit in self.index.query(descriptor, self.settings.nearest, &admit) {
+                if !(hit.similarity > thresholds.theta_sim) {
+                    break;
+                }
+                let window_similarity = self.window_similarity(member, &hit.key, space);
+                if !(window_similarity > thresholds.theta_multi) {
+                    continue;
+                }
+                // Margins make spaces comparable.
+                let margin =
+                    (hit.similarity - thresholds.theta_sim) + (window_similarity - thresholds.theta_multi);
+                let pair = ordered(member, &hit.key);
+                let candidate = Candidate {
+                    a: pair.0.clone(),
+                    b: pair.1.clone(),
+                    space: space.clone(),
+                    similarity: hit.similarity,
+                    window_similarity,
                 };
-                for hit in self.index.query(descriptor, self.settings.nearest, &admit) {
-                    if !(hit.similarity > thresholds.theta_sim) {
-                        break;
-                    }
-                    let window_similarity = self.window_similarity(&member, &hit.key, space);
-                    if !(window_similarity > thresholds.theta_multi) {
-                        continue;
-                    }
-                    // Margins make spaces comparable.
-                    let margin = (hit.similarity - thresholds.theta_sim)
-                        + (window_similarity - thresholds.theta_multi);
-                    let pair = ordered(&member, &hit.key);
-                    let candidate = Candidate {
-                        a: pair.0.clone(),
-                        b: pair.1.clone(),
-                        space: space.clone(),
-                        similarity: hit.similarity,
-                        window_similarity,
-                    };
-                    let known = best.get(&pair).map_or(f32::NEG_INFINITY, |known| known.0);
-                    if margin > known {
-                        best.insert(pair, (margin, candidate));
-                    }
+                let known = rated.get(&pair).map_or(f32::NEG_INFINITY, |known| known.0);
+                if margin > known {
+                    rated.insert(pair, (margin, candidate));
                 }
             }
         }
-        self.tried.extend(best.keys().cloned());
-        let mut ranked: Vec<(f32, Candidate)> = best.into_values().collect();
-        // Stable: equal margins keep the order of the ids.
-        ranked.sort_by(|x, y| y.0.total_cmp(&x.0));
-        ranked.into_iter().map(|(_, candidate)| candidate).collect()
     }
 
     /// Temporal filter. Frames of different agents or lives have no common count.
@@ -162,6 +183,13 @@ impl Candidates {
         let all: Vec<f32> = left.iter().flat_map(|x| right.iter().filter_map(|y| similarity(x, y))).collect();
         if all.is_empty() { f32::NEG_INFINITY } else { all.iter().sum::<f32>() / all.len() as f32 }
     }
+}
+
+fn ranked(rated: Rated) -> Vec<Candidate> {
+    let mut ranked: Vec<(f32, Candidate)> = rated.into_values().collect();
+    // Stable: equal margins keep the order of the ids.
+    ranked.sort_by(|x, y| y.0.total_cmp(&x.0));
+    ranked.into_iter().map(|(_, candidate)| candidate).collect()
 }
 
 fn ordered(a: &SubmapId, b: &SubmapId) -> (SubmapId, SubmapId) {
@@ -235,6 +263,20 @@ mod tests {
         assert!(known.propose(&id("a", 0)).is_empty());
         let rest = known.propose(&id("b", 0));
         assert_eq!(rest.iter().map(|c| (&c.a, &c.b)).collect::<Vec<_>>(), vec![(&id("b", 0), &id("c", 0))]);
+    }
+
+    #[test]
+    fn asking_for_an_anchor_s_own_candidates_may_be_repeated() {
+        let mut known = empty();
+        known.insert(id("a", 0), 0, at(0, 0.0));
+        known.insert(id("a", 1), 20, at(1, 0.0));
+        known.insert(id("b", 0), 0, at(0, 0.0));
+        known.insert(id("b", 1), 20, at(1, 0.0));
+        let first = known.of(&id("b", 0));
+        assert_eq!(first.iter().map(|c| (&c.a, &c.b)).collect::<Vec<_>>(), vec![(&id("a", 0), &id("b", 0))]);
+        assert_eq!(known.propose(&id("b", 0)).len(), 2, "with the window's own");
+        assert_eq!(known.of(&id("b", 0)), first);
+        assert!(known.of(&id("c", 0)).is_empty());
     }
 
     #[test]

@@ -26,6 +26,14 @@ pub use limited::Limited;
 pub use log::{entry_from_bytes, entry_to_bytes, hash, map_id, version_vector};
 pub use payload::{decode_payload, encode_payload};
 
+/// The words of the log that conversions give, for services that know agents by their messages alone.
+pub mod entries {
+    pub use coma_slam::log::{
+        AgentStarted, Entry, EntryKey, Hash, LoopOutcome, LoopVerdict, LoopWithdrawn, OdometryEdge, Payload,
+        SubmapOpened, VersionVector,
+    };
+}
+
 /// Messages, clients and servers, generated from `proto/coma/v1`.
 #[allow(missing_docs, clippy::all, clippy::pedantic)]
 pub mod v1 {

@@ -1,0 +1,170 @@
+//! The graphs of every caller, in bounded number; each is solved once for every state that it was in.
+
+use crate::answer::answer;
+use crate::logs::{Lacking, Logs};
+use coma_pose_graph::GlobalSettings;
+use coma_wire::entries::VersionVector;
+use coma_wire::v1;
+use futures::FutureExt;
+use futures::future::{BoxFuture, Shared};
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+use tokio::sync::Semaphore;
+use tracing::{info, warn};
+
+/// A solve that runs or has run: whoever waits for it gets the same answer.
+type Solving = Shared<BoxFuture<'static, Result<Arc<v1::SolveResponse>, String>>>;
+
+/// One caller's graph.
+#[derive(Default)]
+struct State {
+    logs: Logs,
+    /// The newest solve, and of which version of the logs.
+    solving: Option<(u64, Solving)>,
+}
+
+/// One caller's graph.
+#[derive(Default)]
+pub struct Graph(Mutex<State>);
+
+/// Why there is no answer.
+#[derive(Debug)]
+pub enum NoAnswer {
+    /// The graph does not hold enough.
+    Lacking(Lacking),
+    /// The solver ended badly.
+    Failed(String),
+}
+
+/// How graphs are solved.
+#[derive(Clone)]
+pub struct Solver {
+    /// Everything that shapes a result.
+    pub settings: GlobalSettings,
+    /// One permit for each solve that may run at once.
+    pub work: Arc<Semaphore>,
+}
+
+impl Graph {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Does something with the logs. Never held across an await.
+    pub fn with_logs<T>(&self, f: impl FnOnce(&mut Logs) -> T) -> T {
+        f(&mut self.lock().logs)
+    }
+
+    /// The cold solve of what the graph holds, which is at least `at_least`. A graph that was solved as it is gives
+    /// the answer that it gave. One solve of a graph runs at a time, and goes on if its callers leave: who comes
+    /// back finds it.
+    pub async fn solve(
+        &self,
+        at_least: &VersionVector,
+        solver: &Solver,
+    ) -> Result<Arc<v1::SolveResponse>, NoAnswer> {
+        loop {
+            let (current, solving) = {
+                let mut state = self.lock();
+                if let Some(lacking) = state.logs.lacking(at_least) {
+                    return Err(NoAnswer::Lacking(lacking));
+                }
+                let version = state.logs.version();
+                match &state.solving {
+                    Some((solved, solving))
+                        if *solved == version && !matches!(solving.peek(), Some(Err(_))) =>
+                    {
+                        (true, solving.clone())
+                    }
+                    // Of an older state, and still running: its turn first.
+                    Some((_, solving)) if solving.peek().is_none() => (false, solving.clone()),
+                    _ => {
+                        let solving = begin(state.logs.graph(), solver.clone());
+                        state.solving = Some((version, solving.clone()));
+                        (true, solving)
+                    }
+                }
+            };
+            let answer = solving.await;
+            if current {
+                return answer.map_err(NoAnswer::Failed);
+            }
+        }
+    }
+}
+
+/// Starts a solve on a thread of its own.
+fn begin(graph: crate::facts::Graph, solver: Solver) -> Solving {
+    let task = tokio::spawn(async move {
+        let permit = solver.work.acquire_owned().await.map_err(|_| "the service is ending".to_owned())?;
+        let solve = move || {
+            let _permit = permit;
+            let begin = Instant::now();
+            let solution = coma_pose_graph::solve(&graph.entries, &solver.settings);
+            let seconds = begin.elapsed().as_secs_f64();
+            report(&graph, &solution, seconds);
+            Arc::new(answer(&graph, &solution))
+        };
+        tokio::task::spawn_blocking(solve).await.map_err(|e| format!("the solver ended badly: {e}"))
+    });
+    async move { task.await.map_err(|e| format!("the solver ended badly: {e}"))? }.boxed().shared()
+}
+
+fn report(graph: &crate::facts::Graph, solution: &coma_pose_graph::Solution, seconds: f64) {
+    let (submaps, edges) = (graph.entries.nodes.len(), graph.entries.edges.len());
+    let components = solution.components.len();
+    metrics::counter!("coma_dpgo_solves_total").increment(1);
+    metrics::histogram!("coma_dpgo_solve_seconds").record(seconds);
+    metrics::gauge!("coma_dpgo_graph_submaps").set(submaps as f64);
+    metrics::gauge!("coma_dpgo_graph_edges").set(edges as f64);
+    metrics::gauge!("coma_dpgo_graph_components").set(components as f64);
+    info!(submaps, edges, components, seconds, "graph solved");
+    for component in &solution.components {
+        if let Some(failure) = &component.failure {
+            warn!(map = %component.map_id, failure, "a component keeps the poses that the solve started from");
+        }
+    }
+}
+
+/// The graphs of all callers, by name; the least recently used one makes room for a new one.
+pub struct Graphs {
+    max_graphs: usize,
+    kept: Mutex<(BTreeMap<String, (u64, Arc<Graph>)>, u64)>,
+}
+
+impl Graphs {
+    /// None yet.
+    pub fn new(max_graphs: usize) -> Self {
+        Graphs { max_graphs, kept: Mutex::default() }
+    }
+
+    /// A graph that is here.
+    pub fn get(&self, name: &str) -> Option<Arc<Graph>> {
+        let mut guard = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        let (kept, clock) = &mut *guard;
+        *clock += 1;
+        let (last_used, graph) = kept.get_mut(name)?;
+        *last_used = *clock;
+        Some(graph.clone())
+    }
+
+    /// A graph, made where it is not here.
+    pub fn get_or_make(&self, name: &str) -> Arc<Graph> {
+        if let Some(found) = self.get(name) {
+            return found;
+        }
+        let mut guard = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+        let (kept, clock) = &mut *guard;
+        if kept.len() >= self.max_graphs
+            && !kept.contains_key(name)
+            && let Some(oldest) = kept.iter().min_by_key(|(_, (used, _))| *used).map(|(name, _)| name.clone())
+        {
+            warn!(dropped = oldest, max_graphs = self.max_graphs, "the least recently used graph made room");
+            kept.remove(&oldest);
+        }
+        *clock += 1;
+        let made = || (*clock, Arc::default());
+        kept.entry(name.to_owned()).or_insert_with(made).1.clone()
+    }
+}
