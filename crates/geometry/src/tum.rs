@@ -52,6 +52,13 @@ pub fn stamp(text: &str) -> Option<StampNs> {
     Some(StampNs(if negative { -total } else { total }))
 }
 
+/// Decimal seconds of a stamp, exactly: [`stamp`] gives it back. For stamps whose own text is not known.
+pub fn stamp_text(stamp: StampNs) -> String {
+    let sign = if stamp.0 < 0 { "-" } else { "" };
+    let nanos = stamp.0.unsigned_abs();
+    format!("{sign}{}.{:09}", nanos / 1_000_000_000, nanos % 1_000_000_000)
+}
+
 /// Reads a trajectory. Lines keep their order; quaternions are normalised.
 pub fn parse(text: &str) -> Result<Vec<StampedPose>, TumError> {
     let mut out = Vec::new();
@@ -86,10 +93,7 @@ pub fn parse(text: &str) -> Result<Vec<StampedPose>, TumError> {
 /// Writes one line, without a line break.
 pub fn format_line(stamp_text: &str, pose: &Pose) -> String {
     let (t, q) = (&pose.translation.vector, &pose.rotation.coords);
-    format!(
-        "{stamp_text} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9}",
-        t.x, t.y, t.z, q.x, q.y, q.z, q.w
-    )
+    format!("{stamp_text} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9} {:.9}", t.x, t.y, t.z, q.x, q.y, q.z, q.w)
 }
 
 /// Writes a trajectory.
@@ -117,6 +121,19 @@ mod tests {
         for bad in ["", "-", ".", "nan", "1.2.3", "99999999999999999999", "0x1", "1 2"] {
             assert_eq!(stamp(bad), None, "{bad:?}");
         }
+    }
+
+    #[test]
+    fn stamps_are_written_to_the_nanosecond() {
+        for (nanos, text) in
+            [(1_305_031_102_175_304_000, "1305031102.175304000"), (-1, "-0.000000001"), (0, "0.000000000")]
+        {
+            assert_eq!(stamp_text(StampNs(nanos)), text);
+        }
+        for nanos in [i64::MAX, -i64::MAX, 999_999_999, -1_000_000_001] {
+            assert_eq!(stamp(&stamp_text(StampNs(nanos))), Some(StampNs(nanos)));
+        }
+        assert_eq!(stamp_text(StampNs(i64::MIN)), "-9223372036.854775808");
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Surfels as values and as columns.
 
-use nalgebra::{Matrix3, Quaternion, UnitQuaternion};
+use coma_geometry::Pose;
+use nalgebra::{Matrix3, Point3, Quaternion, UnitQuaternion};
 
 /// One surfel: a disc with centre, two tangent axes and a normal (the columns of its rotation), in the
 /// frame of its submap. Eq. 6 to 8 of the CoMA-SLAM paper say how one is made from a pixel.
@@ -101,6 +102,26 @@ impl FromIterator<Surfel> for SurfelCloud {
 }
 
 impl Surfel {
+    /// The same surfel in another frame of reference. Colour does not depend on where it is seen from.
+    pub fn moved(&self, target_from_source: &Pose) -> Surfel {
+        let [x, y, z] = self.center_m.map(f64::from);
+        let center = target_from_source * Point3::new(x, y, z);
+        let [qw, qx, qy, qz] = self.rotation_wxyz.map(f64::from);
+        let q = target_from_source.rotation.quaternion() * Quaternion::new(qw, qx, qy, qz);
+        Surfel {
+            center_m: [center.x as f32, center.y as f32, center.z as f32],
+            rotation_wxyz: [q.w as f32, q.i as f32, q.j as f32, q.k as f32],
+            ..*self
+        }
+    }
+
+    /// True if every value is finite.
+    pub fn is_finite(&self) -> bool {
+        let Surfel { center_m, rotation_wxyz, scale_m, opacity, color } = self;
+        let values = center_m.iter().chain(rotation_wxyz).chain(scale_m).chain([opacity]).chain(color);
+        values.copied().all(f32::is_finite)
+    }
+
     /// The rotation as a matrix with columns `e1, e2, normal`.
     pub fn rotation(&self) -> Matrix3<f32> {
         let [w, x, y, z] = self.rotation_wxyz;
@@ -128,6 +149,21 @@ mod tests {
         let turned = Surfel { rotation_wxyz: [half, half, 0.0, 0.0], ..SURFEL }.rotation();
         let expected = Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0);
         assert!((turned - expected).norm() < 1e-6, "{turned}");
+    }
+
+    #[test]
+    fn a_moved_surfel_lies_where_its_points_go() {
+        let target_from_source =
+            coma_geometry::se3::exp(&coma_geometry::Tangent::new(1.0, -2.0, 0.5, 0.3, 1.0, -0.4));
+        let moved = SURFEL.moved(&target_from_source);
+        // A point one scale along the first tangent, moved either way.
+        let along = |s: &Surfel| {
+            let e1 = s.rotation().column(0) * s.scale_m[0];
+            Point3::new(s.center_m[0] + e1.x, s.center_m[1] + e1.y, s.center_m[2] + e1.z).cast::<f64>()
+        };
+        assert!((target_from_source * along(&SURFEL) - along(&moved)).norm() < 1e-6);
+        let back = moved.moved(&target_from_source.inverse());
+        assert!(back.center_m.iter().zip(SURFEL.center_m).all(|(a, b)| (a - b).abs() < 1e-6));
     }
 
     #[test]

@@ -131,8 +131,6 @@ fn bounds(surfels: &SurfelCloud) -> ([f32; 3], [f32; 3]) {
 
 fn pack_one(surfel: &Surfel, box_min: &[f32; 3], box_max: &[f32; 3], out: &mut Vec<u8>) {
     let Surfel { center_m, rotation_wxyz, scale_m, opacity, color } = surfel;
-    let values = center_m.iter().chain(rotation_wxyz).chain(scale_m).chain([opacity]).chain(color);
-    let finite = values.copied().all(f32::is_finite);
     for axis in 0..3 {
         let (min, max) = (f64::from(box_min[axis]), f64::from(box_max[axis]));
         let share = if max > min { (f64::from(center_m[axis]) - min) / (max - min) } else { 0.0 };
@@ -147,7 +145,7 @@ fn pack_one(surfel: &Surfel, box_min: &[f32; 3], box_max: &[f32; 3], out: &mut V
         let share = (scale / SCALE_MIN_M).ln() / (SCALE_MAX_M / SCALE_MIN_M).ln();
         out.extend_from_slice(&((share * 65535.0).round() as u16).to_le_bytes());
     }
-    out.push(if finite { byte(*opacity) } else { 0 });
+    out.push(if surfel.is_finite() { byte(*opacity) } else { 0 });
     out.extend(color.map(byte));
 }
 

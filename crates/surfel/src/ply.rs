@@ -65,7 +65,7 @@ pub enum PlyError {
 
 /// Writes surfels. Those with a value that is not finite are left out: viewers choke on them.
 pub fn write(surfels: &SurfelCloud) -> Vec<u8> {
-    let finite: Vec<Surfel> = surfels.iter().filter(is_finite).collect();
+    let finite: Vec<Surfel> = surfels.iter().filter(Surfel::is_finite).collect();
     let mut header = String::from("ply\nformat binary_little_endian 1.0\ncomment CoMA surfels\n");
     let _ = writeln!(header, "element vertex {}", finite.len());
     for name in PROPERTIES {
@@ -113,17 +113,12 @@ pub fn read(bytes: &[u8], max_surfels: usize) -> Result<SurfelCloud, PlyError> {
             opacity: 1.0 / (1.0 + (-float(opacity)).exp()),
             color: color.map(|at| float(at) * SH_C0 + 0.5),
         };
-        if !is_finite(&surfel) {
+        if !surfel.is_finite() {
             return Err(PlyError::Vertex { index });
         }
         out.push(surfel);
     }
     Ok(out)
-}
-
-fn is_finite(surfel: &Surfel) -> bool {
-    let Surfel { center_m, rotation_wxyz, scale_m, opacity, color } = surfel;
-    center_m.iter().chain(rotation_wxyz).chain(scale_m).chain([opacity]).chain(color).all(|v| v.is_finite())
 }
 
 fn values(surfel: &Surfel) -> [f32; 17] {

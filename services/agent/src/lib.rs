@@ -95,7 +95,7 @@ impl Server {
             Some(endpoint) => endpoint.clone(),
             None => reachable(&bound),
         };
-        let (node, anchors) = Node::new(config, endpoint, ledger.clone(), knowledge);
+        let (node, inbox) = Node::new(config, endpoint, ledger.clone(), knowledge);
         let config = &node.config;
         let limit = config.server.max_message_bytes;
         let services = Services::new()
@@ -114,11 +114,11 @@ impl Server {
         let peers = Arc::new(Peers::default());
         let mut tasks = JoinSet::new();
         tasks.spawn(task::places::encoders(node.clone(), place.clone()));
-        tasks.spawn(task::places::describe(node.clone(), anchors, place.clone()));
+        tasks.spawn(task::places::describe(node.clone(), inbox.anchors, place.clone()));
         tasks.spawn(task::places::index(node.clone(), place));
         tasks.spawn(task::verify::run(node.clone(), peers.clone()));
         tasks.spawn(task::solve::run(node.clone(), dpgo));
-        tasks.spawn(find_peers(node.clone(), peers, agent_id.to_string(), epoch.0));
+        tasks.spawn(find_peers(node.clone(), peers, inbox.found, agent_id.to_string(), epoch.0));
 
         let resume = worker::resume_from(&node, &restored.checkpoints)?;
         if resume.is_some() {
@@ -176,19 +176,50 @@ fn own_ip() -> Option<std::net::IpAddr> {
     addresses.map(|a| a.ip()).find(|ip| !ip.is_loopback() && ip.is_ipv4())
 }
 
-/// Follows configured peers, and those that gossip finds.
-async fn find_peers(node: Arc<Node>, peers: Arc<Peers>, agent_id: String, epoch: u64) {
+/// Peers that are followed at once at most: callers and gossip name them, and either may be forged.
+const MAX_FOLLOWED: usize = 256;
+
+/// Follows configured peers, those that call, and those that gossip finds.
+async fn find_peers(
+    node: Arc<Node>,
+    peers: Arc<Peers>,
+    mut found: tokio::sync::mpsc::Receiver<String>,
+    agent_id: String,
+    epoch: u64,
+) {
     let mut followed = BTreeSet::new();
     let mut following = JoinSet::new();
-    for endpoint in &node.config.peers {
-        if followed.insert(endpoint.clone()) {
-            following.spawn(task::peers::follow(node.clone(), peers.clone(), endpoint.clone()));
+    let mut follow = |endpoint: String| {
+        if followed.len() < MAX_FOLLOWED && followed.insert(endpoint.clone()) {
+            following.spawn(task::peers::follow(node.clone(), peers.clone(), endpoint));
+        }
+    };
+    node.config.peers.iter().cloned().for_each(&mut follow);
+    let membership = if node.config.gossip { gossip(&node, &agent_id, epoch).await } else { None };
+    let mut members = membership.as_ref().map(Membership::members);
+    loop {
+        if let Some(members) = &mut members {
+            let alive = |m: &&coma_runtime::Member| m.alive && m.agent_id != agent_id;
+            members.borrow_and_update().iter().filter(alive).map(|m| m.endpoint.clone()).for_each(&mut follow);
+        }
+        let changed = async {
+            match &mut members {
+                Some(members) => members.changed().await.is_ok(),
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            endpoint = found.recv() => match endpoint {
+                Some(endpoint) => follow(endpoint),
+                None => return,
+            },
+            alive = changed => if !alive { members = None },
         }
     }
-    if !node.config.gossip {
-        while following.join_next().await.is_some() {}
-        return std::future::pending().await;
-    }
+}
+
+/// Joins the gossip of the cluster; without it only configured peers and callers are followed.
+async fn gossip(node: &Node, agent_id: &str, epoch: u64) -> Option<Membership> {
     let mut settings = node.config.membership.clone();
     settings.cluster_id = node.config.cluster_id.clone();
     if settings.listen.ip().is_unspecified()
@@ -200,31 +231,14 @@ async fn find_peers(node: Arc<Node>, peers: Arc<Peers>, agent_id: String, epoch:
     let generation = std::time::SystemTime::now()
         .duration_since(std::time::UNIX_EPOCH)
         .map_or(epoch, |since| since.as_millis() as u64);
-    let myself = Myself { agent_id: agent_id.clone(), epoch, generation, endpoint: node.endpoint.clone() };
-    let membership = match Membership::start(&settings, &myself, &node.ledger).await {
-        Ok(membership) => membership,
+    let endpoint = node.endpoint.clone();
+    let myself = Myself { agent_id: agent_id.to_owned(), epoch, generation, endpoint };
+    match Membership::start(&settings, &myself, &node.ledger).await {
+        Ok(membership) => Some(membership),
         Err(e) => {
-            warn!(error = %e, "no gossip: only configured peers are followed");
+            warn!(error = %e, "no gossip: only configured peers and callers are followed");
             node.lock().warnings.push(format!("no gossip: {e}"));
-            while following.join_next().await.is_some() {}
-            return std::future::pending().await;
-        }
-    };
-    let mut members = membership.members();
-    loop {
-        let found: Vec<String> = members
-            .borrow_and_update()
-            .iter()
-            .filter(|m| m.alive && m.agent_id != agent_id)
-            .map(|m| m.endpoint.clone())
-            .collect();
-        for endpoint in found {
-            if followed.insert(endpoint.clone()) {
-                following.spawn(task::peers::follow(node.clone(), peers.clone(), endpoint));
-            }
-        }
-        if members.changed().await.is_err() {
-            return;
+            None
         }
     }
 }

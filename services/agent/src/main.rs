@@ -37,7 +37,7 @@ async fn main() -> anyhow::Result<()> {
     }
     let handle = Server::start(config).await?;
     println!("agent {} serves on {}", handle.agent_id, handle.url);
-    coma_runtime::shutdown::asked().await;
+    coma_runtime::shutdown::requested().await;
     handle.shutdown().await;
     Ok(())
 }

@@ -44,19 +44,32 @@ pub struct Node {
     acks: broadcast::Sender<v1::FrameAck>,
     events: broadcast::Sender<v1::watch_response::Event>,
     anchors: mpsc::UnboundedSender<AnchorJob>,
+    found: mpsc::Sender<String>,
     begin: Instant,
 }
 
+/// What a node hands to its tasks.
+pub struct Inbox {
+    /// Anchors on their way to place recognition. They need no bound of their own: there is one per submap, and
+    /// the frame queue bounds those.
+    pub anchors: mpsc::UnboundedReceiver<AnchorJob>,
+    /// Endpoints of agents that called.
+    pub found: mpsc::Receiver<String>,
+}
+
+/// Callers' endpoints that wait to be followed; more are forgotten, as they call again.
+const FOUND: usize = 64;
+
 impl Node {
-    /// An agent that is about to run, and the anchors that it will send to place recognition. Anchors need no
-    /// bound of their own: there is one per submap, and the frame queue bounds those.
+    /// An agent that is about to run, and what its tasks are to take.
     pub fn new(
         config: AgentConfig,
         endpoint: String,
         ledger: ByteLedger,
         knowledge: Knowledge,
-    ) -> (Arc<Self>, mpsc::UnboundedReceiver<AnchorJob>) {
+    ) -> (Arc<Self>, Inbox) {
         let (anchors, described) = mpsc::unbounded_channel();
+        let (found, followed) = mpsc::channel(FOUND);
         let node = Node {
             queue: FrameQueue::new(config.queue_frames),
             config,
@@ -71,9 +84,10 @@ impl Node {
             acks: broadcast::channel(4096).0,
             events: broadcast::channel(1024).0,
             anchors,
+            found,
             begin: Instant::now(),
         };
-        (Arc::new(node), described)
+        (Arc::new(node), Inbox { anchors: described, found: followed })
     }
 
     /// What the agent knows. Never held across an await.
@@ -117,6 +131,14 @@ impl Node {
         self.unfinished.fetch_add(1, Ordering::SeqCst);
         if self.anchors.send(AnchorJob { submap, frame }).is_err() {
             self.unfinished.fetch_sub(1, Ordering::SeqCst);
+        }
+    }
+
+    /// An agent of this cluster called and says where it serves: it is followed too.
+    pub fn found_peer(&self, endpoint: &str) {
+        if !endpoint.is_empty() && endpoint.len() <= 256 {
+            // Full: it is found when it calls again.
+            let _ = self.found.try_send(endpoint.to_owned());
         }
     }
 

@@ -44,8 +44,10 @@ pub struct Processed {
     pub work_budget: u32,
     /// And used.
     pub work_used: u32,
-    /// Wall seconds of tracking and mapping.
-    pub seconds: f64,
+    /// Wall time, seconds.
+    pub tracking_s: f64,
+    /// Wall time, seconds.
+    pub mapping_s: f64,
 }
 
 impl Session {
@@ -102,6 +104,8 @@ impl Session {
             dropped_frames: self.dropped,
             work_budget: processed.work_budget.into(),
             work_used: processed.work_used.into(),
+            tracking_s: processed.tracking_s,
+            mapping_s: processed.mapping_s,
         }
     }
 }

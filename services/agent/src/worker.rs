@@ -76,8 +76,10 @@ struct Worker {
 impl Worker {
     fn frame(&mut self, frame: Arc<RgbdFrame>, options: FrameOptions) -> anyhow::Result<()> {
         let begin = Instant::now();
-        let outcome = self.agent.on_frame(frame.clone(), options);
-        let seconds = begin.elapsed().as_secs_f64();
+        let located = self.agent.locate(&frame);
+        let tracked_s = begin.elapsed().as_secs_f64();
+        let outcome = self.agent.take(frame.clone(), located, options);
+        let mapped_s = begin.elapsed().as_secs_f64() - tracked_s;
         let mut durable_through = None;
         for event in &outcome.events {
             if let Some(through) = self.on_event(event, &frame, &outcome)? {
@@ -94,7 +96,8 @@ impl Worker {
         let mut knowledge = self.node.lock();
         knowledge.frames += 1;
         knowledge.state = outcome.state.clone();
-        *knowledge.stage_seconds.entry("frame".into()).or_default() += seconds;
+        *knowledge.stage_seconds.entry("tracking".into()).or_default() += tracked_s;
+        *knowledge.stage_seconds.entry("mapping".into()).or_default() += mapped_s;
         if let Some((id, revision, surfels, copy)) = active {
             knowledge.submaps.insert(id.clone(), OwnSubmap { revision, surfels, blob: None });
             if let Some(copy) = copy {
@@ -119,7 +122,8 @@ impl Worker {
             state: outcome.state,
             work_budget: options.step_budget,
             work_used: outcome.mapped.steps,
-            seconds,
+            tracking_s: tracked_s,
+            mapping_s: mapped_s,
         });
         Ok(())
     }

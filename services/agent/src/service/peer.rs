@@ -43,6 +43,7 @@ impl Peer for PeerService {
                 .map_err(|e| Status::permission_denied(e.to_string()))?;
             connection.set_class(Class::Peer);
         }
+        node.found_peer(&hello.endpoint);
         let knowledge = node.lock();
         Ok(Response::new(v1::HelloResponse {
             protocol_major: PROTOCOL_MAJOR,
