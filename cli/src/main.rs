@@ -1,9 +1,14 @@
 //! `coma`: the whole cluster in one program.
 
 mod bench;
+mod cluster;
+mod collect;
+mod eval;
 mod fault;
 mod progress;
+mod run;
 mod source;
+mod stream;
 
 use clap::{Parser, Subcommand};
 
@@ -17,13 +22,20 @@ struct Arguments {
 
 #[derive(Subcommand)]
 enum Command {
+    Run(run::Arguments),
+    Eval(eval::Arguments),
     /// Measures one part and prints its figures.
     #[command(subcommand)]
     Bench(bench::Bench),
 }
 
-fn main() -> anyhow::Result<()> {
-    match Arguments::parse().command {
+#[tokio::main]
+async fn main() -> anyhow::Result<()> {
+    let arguments = Arguments::parse();
+    coma_runtime::logging::init(&Default::default())?;
+    match arguments.command {
+        Command::Run(arguments) => run::run(arguments).await,
+        Command::Eval(arguments) => eval::run(arguments).await,
         Command::Bench(bench) => bench::run(&bench),
     }
 }

@@ -14,3 +14,13 @@ fn bar(name: &str, length: u64, template: &str) -> ProgressBar {
     let style = ProgressStyle::with_template(template).expect("the template is fixed").progress_chars("=> ");
     ProgressBar::with_draw_target(Some(length), target).with_style(style).with_prefix(name.to_owned())
 }
+
+/// Something that takes a while; its message says what.
+pub fn spinner(name: &str) -> ProgressBar {
+    bar(name, 0, "{prefix:>12} {spinner} {msg}")
+}
+
+/// Steps of some work.
+pub fn steps(name: &str, length: u64) -> ProgressBar {
+    bar(name, length, "{prefix:>12} [{bar:30}] {pos}/{len} {eta:>6} left {msg}")
+}

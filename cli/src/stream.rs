@@ -9,6 +9,7 @@ use coma_wire::v1::agent_client::AgentClient;
 use coma_wire::v1::stream_frames_response::Event;
 use coma_wire::{Calibration, ColorData, DepthData, EncodedFrame, Wire, encode_frame, v1};
 use indicatif::ProgressBar;
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 use tokio::sync::mpsc;
@@ -50,6 +51,8 @@ pub struct Streamed {
     pub dropped: u64,
     /// Frames that it refused, with its reason.
     pub refused: Vec<String>,
+    /// Wall seconds of each processed frame that was acknowledged, by stage.
+    pub frame_seconds: BTreeMap<String, Vec<f64>>,
 }
 
 type Shared = Arc<Mutex<Box<dyn Sequence>>>;
@@ -161,7 +164,6 @@ async fn play(
         Ok(())
     });
     let mut answers = client.stream_frames(ReceiverStream::new(frames)).await?.into_inner();
-    let mut last_processed = None;
     loop {
         let answer = match answers.message().await {
             Ok(Some(answer)) => answer,
@@ -177,8 +179,10 @@ async fn play(
             Some(Event::Ack(ack)) => {
                 streamed.dropped = ack.dropped_frames;
                 if let Some(through) = ack.processed_through {
-                    last_processed = Some(through);
                     progress.set_position(through + 1);
+                    for (stage, seconds) in [("tracking", ack.tracking_s), ("mapping", ack.mapping_s)] {
+                        streamed.frame_seconds.entry(stage.into()).or_default().push(seconds);
+                    }
                 }
                 if let Some(state) = ack.pose.map(|pose| pose.state()) {
                     let message = if state == v1::TrackingState::Degraded { "tracking is degraded" } else { "" };
@@ -194,7 +198,6 @@ async fn play(
         }
     }
     reader.await??;
-    let _ = last_processed;
     Ok(true)
 }
 

@@ -12,6 +12,8 @@ mod deny;
 mod image;
 mod layers;
 mod licence;
+#[cfg(test)]
+mod links;
 mod rust_source;
 mod steps;
 

@@ -28,6 +28,8 @@ pub struct Facts {
     pub wall_s: f64,
     /// Processor time of the whole program in that time, seconds, where the system tells.
     pub cpu_s: Option<f64>,
+    /// What was asked for, as it was given.
+    pub specs: Vec<String>,
     /// The agents, in the order of their specs.
     pub agents: Vec<AgentFacts>,
     /// Maps that did not merge, the one with most frames first.

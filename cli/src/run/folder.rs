@@ -1,0 +1,44 @@
+//! The run's folder, but for its scores: `run.json`, `loops.json`, `graph.g2o`, trajectories, maps.
+
+use super::facts::Facts;
+use super::gather::Results;
+use anyhow::Context;
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// Writes a file so that it is there whole or not at all.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
+    let shown = path.display();
+    let part = path.with_extension("part");
+    std::fs::write(&part, bytes).with_context(|| format!("{shown}"))?;
+    std::fs::rename(&part, path).with_context(|| format!("{shown}"))
+}
+
+/// File of one agent's trajectory in one component, below `trajectories/`: `<agent>.tum` for the component that
+/// holds most of its frames, `<agent>.component-N.tum` for others.
+pub fn trajectory_name(facts: &Facts, agent: usize, component: usize) -> String {
+    let count = |c: usize| facts.agents[agent].poses.iter().filter(|p| p.component == c).count();
+    let components: BTreeSet<usize> = facts.agents[agent].poses.iter().map(|p| p.component).collect();
+    let main = components.iter().copied().max_by_key(|c| (count(*c), usize::MAX - c));
+    let name = &facts.agents[agent].name;
+    if main == Some(component) { format!("{name}.tum") } else { format!("{name}.component-{component}.tum") }
+}
+
+/// Writes everything that needs no truth. `stamps` are the texts of each agent's stamps.
+pub fn write(out: &Path, facts: &Facts, results: &Results, stamps: &[Vec<String>]) -> anyhow::Result<()> {
+    let trajectories = out.join("trajectories");
+    std::fs::create_dir_all(&trajectories).with_context(|| trajectories.display().to_string())?;
+    for ((agent, component), poses) in &results.trajectories {
+        let lines = poses.iter().map(|(frame, pose)| (stamps[*agent][*frame].as_str(), pose));
+        let path = trajectories.join(trajectory_name(facts, *agent, *component));
+        write_atomically(&path, coma_geometry::tum::format(lines).as_bytes())?;
+    }
+    for (component, map) in facts.components.iter().zip(&results.maps) {
+        if !component.map.is_empty() {
+            write_atomically(&out.join(&component.map), &coma_surfel::ply::write(map))?;
+        }
+    }
+    write_atomically(&out.join("graph.g2o"), results.g2o.as_bytes())?;
+    write_atomically(&out.join("loops.json"), &serde_json::to_vec_pretty(&results.loops)?)?;
+    write_atomically(&out.join("run.json"), &serde_json::to_vec(facts)?)
+}
