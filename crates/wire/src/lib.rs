@@ -30,7 +30,7 @@ pub use payload::{decode_payload, encode_payload};
 pub mod entries {
     pub use coma_slam::log::{
         AgentStarted, Entry, EntryKey, Hash, LoopOutcome, LoopVerdict, LoopWithdrawn, OdometryEdge, Payload,
-        SubmapOpened, VersionVector,
+        SolveDigest, SubmapOpened, VersionVector,
     };
 }
 

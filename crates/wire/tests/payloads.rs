@@ -1,7 +1,7 @@
 //! Payloads: they survive the wire bit for bit, and foreign bytes are refused without a panic.
 
 use coma_geometry::{AgentId, Epoch, Matrix6, Pose, StampNs, SubmapId};
-use coma_place::Descriptor;
+use coma_place::{Descriptor, Space};
 use coma_slam::log::*;
 use coma_wire::{At, Wire, decode_payload, encode_payload, v1};
 use nalgebra::Vector3;
@@ -39,8 +39,13 @@ fn evidence() -> impl Strategy<Value = Evidence> {
 }
 
 fn descriptors() -> impl Strategy<Value = Descriptor> {
-    ("[a-z/0-9]{1,30}", 1e-4..1.0f32, prop::collection::vec(any::<i8>(), 1..64))
-        .prop_map(|(space, scale, values)| Descriptor { space, scale, values })
+    ("[a-z/0-9]{1,30}", 1e-4..1.0f32, prop::collection::vec(any::<i8>(), 1..64)).prop_map(
+        |(space, scale, mut values)| {
+            // All zero is no direction.
+            values[0] |= 1;
+            Descriptor::new(Space::new(&space).unwrap(), scale, values).unwrap()
+        },
+    )
 }
 
 fn outcomes() -> impl Strategy<Value = LoopOutcome> {
