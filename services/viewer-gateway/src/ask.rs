@@ -49,6 +49,7 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for Json<T> {
                 }
                 path => match field_of(&message) {
                     ("", message) => ApiError::bad(path, message),
+                    (field, message) if path.ends_with(field) => ApiError::bad(path, message),
                     (field, message) => ApiError::bad(&format!("{path}.{field}"), message),
                 },
             }
@@ -66,7 +67,9 @@ fn field_of(message: &str) -> (&str, &str) {
         }
     }
     match message.split_once(": ") {
-        Some((field, rest)) if !field.is_empty() && field.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_') => {
+        Some((field, rest))
+            if !field.is_empty() && field.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_') =>
+        {
             (field, rest)
         }
         _ => ("", message),

@@ -91,7 +91,8 @@ impl IntoResponse for ApiError {
         if status.is_server_error() {
             tracing::warn!(%status, field, message, "a request failed");
         }
-        let mut response = (status, Json(Problem { error: ProblemDetail { field, message } })).into_response();
+        let mut response =
+            (status, Json(Problem { error: ProblemDetail { field, message } })).into_response();
         if status == StatusCode::SERVICE_UNAVAILABLE {
             response.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from_static("1"));
         }

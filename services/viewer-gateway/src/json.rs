@@ -108,8 +108,10 @@ impl FramePose {
     /// Checked.
     pub fn read(m: v1::PoseEstimate, at: &At<'_>) -> Result<Self, FieldError> {
         let submap: SubmapId = at.field("submap_id").required(m.submap_id)?;
-        let submap_from_camera: coma_geometry::Pose = at.field("submap_from_camera").required(m.submap_from_camera)?;
-        let agent_from_camera: coma_geometry::Pose = at.field("agent_from_camera").required(m.agent_from_camera)?;
+        let submap_from_camera: coma_geometry::Pose =
+            at.field("submap_from_camera").required(m.submap_from_camera)?;
+        let agent_from_camera: coma_geometry::Pose =
+            at.field("agent_from_camera").required(m.agent_from_camera)?;
         let map_from_camera: Option<coma_geometry::Pose> =
             at.field("map_from_camera").optional(m.map_from_camera)?;
         let map = m.generation.and_then(|g| g.map_id);
@@ -206,18 +208,22 @@ pub struct Component {
 
 impl Component {
     /// Checked.
-    pub fn read(m: v1::Component, at: &At<'_>) -> Result<(Self, Vec<(SubmapId, coma_geometry::Pose)>), FieldError> {
+    pub fn read(
+        m: v1::Component,
+        at: &At<'_>,
+    ) -> Result<(Self, Vec<(SubmapId, coma_geometry::Pose)>), FieldError> {
         let at_generation = at.field("generation");
         let generation = m.generation.ok_or_else(|| at_generation.refuse("is missing"))?;
         let generation = Generation::read(generation, &at_generation)?;
         let at_poses = at.field("poses");
-        let mut poses = Vec::with_capacity(m.poses.len());
+        let mut poses: Vec<(SubmapId, coma_geometry::Pose)> = Vec::with_capacity(m.poses.len());
         for (i, pose) in m.poses.into_iter().enumerate() {
             let at = at_poses.index(i);
             let id: SubmapId = at.field("submap_id").required(pose.submap_id)?;
             poses.push((id, at.field("map_from_submap").required(pose.map_from_submap)?));
         }
-        let submaps = poses.iter().map(|(id, pose)| SubmapPose { id: id.to_string(), map_from_submap: pose.into() });
+        let submaps =
+            poses.iter().map(|(id, pose)| SubmapPose { id: id.to_string(), map_from_submap: pose.into() });
         let component =
             Component { generation, submaps: submaps.collect(), cost: m.cost, iterations: m.iterations };
         Ok((component, poses))

@@ -57,7 +57,8 @@ impl Server {
         // Whatever fails below ends what was started.
         let guard = stop.clone().drop_guard();
         let listen = config.listen;
-        let listener = TcpListener::bind(listen).await.with_context(|| format!("cannot listen on {listen}"))?;
+        let listener =
+            TcpListener::bind(listen).await.with_context(|| format!("cannot listen on {listen}"))?;
         let local_addr = listener.local_addr()?;
         if config.token.is_none() && !local_addr.ip().is_loopback() {
             tracing::warn!(%local_addr, "open to everyone who can reach it (insecure = true)");
@@ -66,7 +67,8 @@ impl Server {
         let router = api::router(Gateway::new(config, directory, stop.clone()));
         let asked = stop.clone();
         let task = tokio::spawn(async move {
-            let serving = axum::serve(listener, router).with_graceful_shutdown(asked.clone().cancelled_owned());
+            let serving =
+                axum::serve(listener, router).with_graceful_shutdown(asked.clone().cancelled_owned());
             let serving = std::pin::pin!(serving.into_future());
             let late = async {
                 asked.cancelled().await;

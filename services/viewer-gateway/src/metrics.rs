@@ -16,19 +16,28 @@ struct Family {
 /// What agents say, and what the gateway keeps, as text.
 pub fn of_agents(links: &[Arc<Link>], cache_bytes: usize) -> String {
     let family = |name, kind, help| Family { name, kind, help, samples: Vec::new() };
-    let mut reachable = family("coma_agent_reachable", "gauge", "1 if the agent answered the last time it was asked.");
-    let mut frames = family("coma_agent_frames_processed_total", "counter", "Frames that the agent has tracked.");
-    let mut dropped = family("coma_agent_frames_dropped_total", "counter", "Frames that found the queue full.");
+    let mut reachable =
+        family("coma_agent_reachable", "gauge", "1 if the agent answered the last time it was asked.");
+    let mut frames =
+        family("coma_agent_frames_processed_total", "counter", "Frames that the agent has tracked.");
+    let mut dropped =
+        family("coma_agent_frames_dropped_total", "counter", "Frames that found the queue full.");
     let mut submaps = family("coma_agent_submaps", "gauge", "Submaps of the agent.");
     let mut surfels = family("coma_agent_surfels", "gauge", "Surfels of the agent.");
     let mut lost = family("coma_agent_tracking_lost", "gauge", "1 while the camera is lost.");
     let mut warnings = family("coma_agent_warnings", "gauge", "Things that the agent wants users to know.");
     let mut peers = family("coma_agent_peer_alive", "gauge", "1 if the agent reaches the peer.");
     let mut seconds = family("coma_agent_stage_seconds_total", "counter", "Wall seconds by stage.");
-    let mut bytes =
-        family("coma_agent_sent_bytes_total", "counter", "Bytes that the agent wrote, by class and message type.");
-    let mut messages =
-        family("coma_agent_sent_messages_total", "counter", "Messages that the agent wrote, by class and type.");
+    let mut bytes = family(
+        "coma_agent_sent_bytes_total",
+        "counter",
+        "Bytes that the agent wrote, by class and message type.",
+    );
+    let mut messages = family(
+        "coma_agent_sent_messages_total",
+        "counter",
+        "Messages that the agent wrote, by class and type.",
+    );
     for link in links {
         let state = link.state();
         let name = state.id.as_ref().map_or_else(|| link.endpoint.clone(), ToString::to_string);
@@ -100,6 +109,9 @@ mod tests {
         let family = Family { name: "x_total", kind: "counter", help: "Xs.", samples };
         let mut text = String::new();
         write_family(&family, &mut text);
-        assert_eq!(text, "# HELP x_total Xs.\n# TYPE x_total counter\nx_total{agent=\"a\\\"b\\\\c\\nd\"} 3\n");
+        assert_eq!(
+            text,
+            "# HELP x_total Xs.\n# TYPE x_total counter\nx_total{agent=\"a\\\"b\\\\c\\nd\"} 3\n"
+        );
     }
 }

@@ -102,11 +102,18 @@ fn byte(unit: f32) -> u8 {
     (unit.clamp(0.0, 1.0) * 255.0).round() as u8
 }
 
-fn write(pixels: &[u8], size: &Image<f32>, kind: ExtendedColorType, format: Format) -> Result<Vec<u8>, ImageError> {
+fn write(
+    pixels: &[u8],
+    size: &Image<f32>,
+    kind: ExtendedColorType,
+    format: Format,
+) -> Result<Vec<u8>, ImageError> {
     let (width, height) = (size.width() as u32, size.height() as u32);
     let mut file = Vec::new();
     match format {
-        Format::Png => image::codecs::png::PngEncoder::new(&mut file).write_image(pixels, width, height, kind)?,
+        Format::Png => {
+            image::codecs::png::PngEncoder::new(&mut file).write_image(pixels, width, height, kind)?
+        }
         Format::Jpeg => {
             let encoder = image::codecs::jpeg::JpegEncoder::new_with_quality(&mut file, QUALITY);
             encoder.write_image(pixels, width, height, kind)?;

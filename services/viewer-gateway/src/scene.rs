@@ -97,13 +97,14 @@ pub async fn load(
     let surfels = scene.submaps.iter().fold(0u64, |sum, submap| sum.saturating_add(submap.surfels));
     if surfels > max_surfels as u64 {
         let map = map_text(&scene.map);
-        let message = format!("map {map} has {surfels} surfels, at most {max_surfels} (max_surfels) are taken");
+        let message =
+            format!("map {map} has {surfels} surfels, at most {max_surfels} (max_surfels) are taken");
         return Err(ApiError::too_large("map", message));
     }
-    let with_surfels = scene.submaps.iter().filter(|submap| submap.surfels > 0);
+    let with_surfels: Vec<PlacedSubmap> = scene.submaps.iter().filter(|s| s.surfels > 0).cloned().collect();
     let fetched: Vec<(Pose, Arc<CachedSurfels>)> = stream::iter(with_surfels)
-        .map(|submap| async move {
-            Ok::<_, ApiError>((submap.map_from_submap, fetch(directory, cache, submap, max_surfels).await?))
+        .map(|submap: PlacedSubmap| async move {
+            Ok::<_, ApiError>((submap.map_from_submap, fetch(directory, cache, &submap, max_surfels).await?))
         })
         .buffered(AT_ONCE)
         .try_collect()
@@ -111,7 +112,9 @@ pub async fn load(
     let unpack = move || {
         let surfels = fetched.into_iter().map(|(map_from_submap, cached)| {
             let surfels = cached.surfels(max_surfels);
-            surfels.map(|surfels| (map_from_submap, surfels)).map_err(|e| ApiError::agent(format!("surfels: {e}")))
+            surfels
+                .map(|surfels| (map_from_submap, surfels))
+                .map_err(|e| ApiError::agent(format!("surfels: {e}")))
         });
         surfels.collect()
     };

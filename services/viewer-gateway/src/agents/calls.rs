@@ -121,7 +121,9 @@ impl Link {
             let mut revision = 0;
             while let Some(message) = stream.message().await? {
                 if packed.len() + message.chunk.len() > limit {
-                    return Err(Status::resource_exhausted(format!("submap {id} has more than {max_surfels} surfels")));
+                    return Err(Status::resource_exhausted(format!(
+                        "submap {id} has more than {max_surfels} surfels"
+                    )));
                 }
                 packed.extend_from_slice(&message.chunk);
                 revision = message.revision;

@@ -52,7 +52,9 @@ impl Directory {
                 None => ("http", name.as_str()),
             };
             let port = host.rsplit_once(':').and_then(|(_, port)| port.parse::<u16>().ok());
-            port.with_context(|| format!("agents_dns = {name:?} must be a name and a port, like agent:7001"))?;
+            port.with_context(|| {
+                format!("agents_dns = {name:?} must be a name and a port, like agent:7001")
+            })?;
             let (directory, scheme, host) = (directory.clone(), scheme.to_owned(), host.to_owned());
             tokio::spawn(async move {
                 stop.run_until_cancelled(directory.ask_dns(&scheme, &host)).await;
@@ -130,7 +132,8 @@ impl Directory {
             match state.id {
                 None => nameless.push(link),
                 Some(id) => {
-                    let better = by_id.get(&id).is_none_or(|known| state.reachable && !known.state().reachable);
+                    let better =
+                        by_id.get(&id).is_none_or(|known| state.reachable && !known.state().reachable);
                     if better {
                         by_id.insert(id, link);
                     }
@@ -152,7 +155,10 @@ impl Directory {
     }
 
     /// Asks every agent; those that do not answer are named.
-    pub async fn ask<T, F: Future<Output = Result<T, Status>>>(&self, ask: impl Fn(Arc<Link>) -> F) -> Whole<T> {
+    pub async fn ask<T, F: Future<Output = Result<T, Status>>>(
+        &self,
+        ask: impl Fn(Arc<Link>) -> F,
+    ) -> Whole<T> {
         ask_all(self.agents(), ask).await
     }
 

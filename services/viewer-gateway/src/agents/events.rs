@@ -2,7 +2,7 @@
 
 use super::calls::PlacedSubmap;
 use crate::json::{self, Component, FramePose};
-use coma_slam::log::{LoopOutcome, LoopVerdict};
+use coma_wire::entries::{LoopOutcome, LoopVerdict};
 use coma_wire::v1::watch_response::Event;
 use coma_wire::{At, FieldError, Wire};
 use serde::Serialize;
@@ -70,7 +70,9 @@ pub fn live_event(event: Event) -> Result<LiveEvent, FieldError> {
             let agent = pose.submap.split('/').next().unwrap_or_default().to_owned();
             LiveEvent::Pose { agent, pose }
         }
-        Event::Submap(info) => LiveEvent::Submap { submap: PlacedSubmap::read(info, &At::Root("submap"))?.json() },
+        Event::Submap(info) => {
+            LiveEvent::Submap { submap: PlacedSubmap::read(info, &At::Root("submap"))?.json() }
+        }
         Event::Correction(component) => {
             LiveEvent::Correction { component: Component::read(component, &At::Root("correction"))?.0 }
         }

@@ -115,7 +115,12 @@ pub fn plain(status: &Status) -> String {
     if message.is_empty() { status.code().description().to_owned() } else { message.to_owned() }
 }
 
-async fn ask_status(link: Arc<Link>, every: Duration, within: Duration, events: broadcast::Sender<LiveEvent>) {
+async fn ask_status(
+    link: Arc<Link>,
+    every: Duration,
+    within: Duration,
+    events: broadcast::Sender<LiveEvent>,
+) {
     let mut client = AgentClient::new(link.channel.clone()).limited(link.message_bytes);
     loop {
         let answer = tokio::time::timeout(within, client.get_status(v1::GetStatusRequest {})).await;
@@ -146,7 +151,9 @@ async fn follow_events(link: Arc<Link>, pause: Duration, events: broadcast::Send
             while let Ok(Some(message)) = stream.message().await {
                 match message.event.map(live_event) {
                     Some(Ok(event)) => drop(events.send(event)),
-                    Some(Err(e)) => tracing::warn!(endpoint = link.endpoint, error = %e, "an event can't be read"),
+                    Some(Err(e)) => {
+                        tracing::warn!(endpoint = link.endpoint, error = %e, "an event can't be read")
+                    }
                     // Of a kind that only newer gateways know.
                     None => {}
                 }

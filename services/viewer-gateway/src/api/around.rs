@@ -37,7 +37,8 @@ pub async fn admitted(State(gateway): State<Arc<Gateway>>, request: Request, nex
         Ok(_place) => next.run(request).await,
         Err(_) => {
             let limit = gateway.config.max_requests;
-            ApiError::busy(format!("{limit} requests are under work, the limit of this gateway")).into_response()
+            ApiError::busy(format!("{limit} requests are under work, the limit of this gateway"))
+                .into_response()
         }
     }
 }
@@ -46,7 +47,8 @@ pub async fn admitted(State(gateway): State<Arc<Gateway>>, request: Request, nex
 pub async fn in_time(request: Request, next: Next) -> Response {
     match tokio::time::timeout(LONGEST, next.run(request)).await {
         Ok(response) => response,
-        Err(_) => ApiError::plain(StatusCode::GATEWAY_TIMEOUT, format!("no answer within {LONGEST:?}")).into_response(),
+        Err(_) => ApiError::plain(StatusCode::GATEWAY_TIMEOUT, format!("no answer within {LONGEST:?}"))
+            .into_response(),
     }
 }
 
@@ -59,6 +61,7 @@ pub async fn counted(request: Request, next: Next) -> Response {
     let status = response.status().as_u16().to_string();
     metrics::counter!("coma_gateway_requests_total", "route" => route.clone(), "method" => method, "status" => status)
         .increment(1);
-    metrics::histogram!("coma_gateway_request_seconds", "route" => route).record(begin.elapsed().as_secs_f64());
+    metrics::histogram!("coma_gateway_request_seconds", "route" => route)
+        .record(begin.elapsed().as_secs_f64());
     response
 }

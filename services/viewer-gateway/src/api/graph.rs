@@ -6,8 +6,8 @@ use crate::json::{Component, Pose, Unreachable, log_text, text};
 use axum::Json;
 use axum::extract::State;
 use coma_geometry::{AgentId, SubmapId};
-use coma_slam::log::{EntryKey, LoopOutcome, LoopVerdict, Payload};
-use coma_wire::{At, FieldError, Wire, v1};
+use coma_wire::entries::{EntryKey, LoopOutcome, LoopVerdict, Payload};
+use coma_wire::{At, FieldError, v1};
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -132,12 +132,12 @@ impl Views {
         };
         Views(directory.ask(ask).await)
     }
-
 }
 
 /// The place of the view whose results are made of most entries; of equals, of the agent with the smallest name.
 fn newest(answers: &[(AgentId, View)]) -> Option<usize> {
-    let entries = |view: &View| view.components.iter().map(|(c, _)| c.generation.entries()).max().unwrap_or(0);
+    let entries =
+        |view: &View| view.components.iter().map(|(c, _)| c.generation.entries()).max().unwrap_or(0);
     (0..answers.len()).rev().max_by_key(|i| entries(&answers[*i].1))
 }
 
@@ -193,7 +193,8 @@ fn assemble(Views(whole): Views) -> Graph {
         if Some(i) == newest {
             graph.components = view.components.into_iter().map(|(component, _)| component).collect();
             solutions = view.weights.into_iter().collect();
-            let not_joined = |n: v1::NotJoined| NotJoined { agent_a: n.agent_a, agent_b: n.agent_b, message: n.message };
+            let not_joined =
+                |n: v1::NotJoined| NotJoined { agent_a: n.agent_a, agent_b: n.agent_b, message: n.message };
             graph.not_joined = view.not_joined.into_iter().map(not_joined).collect();
         }
     }
@@ -219,12 +220,17 @@ fn assemble(Views(whole): Views) -> Graph {
 }
 
 /// Verdicts in the order of their keys.
-fn loops(entries: &BTreeMap<EntryKey, Payload>, mut solutions: BTreeMap<EntryKey, LoopInSolution>) -> Vec<Loop> {
+fn loops(
+    entries: &BTreeMap<EntryKey, Payload>,
+    mut solutions: BTreeMap<EntryKey, LoopInSolution>,
+) -> Vec<Loop> {
     let withdrawn: BTreeMap<&EntryKey, &str> = entries
         .iter()
         .filter_map(|(by, payload)| match payload {
             // Only its author can take a verdict back.
-            Payload::LoopWithdrawn(w) if w.verdict.agent == by.agent => Some((&w.verdict, w.message.as_str())),
+            Payload::LoopWithdrawn(w) if w.verdict.agent == by.agent => {
+                Some((&w.verdict, w.message.as_str()))
+            }
             _ => None,
         })
         .collect();
@@ -240,7 +246,9 @@ fn loops(entries: &BTreeMap<EntryKey, Payload>, mut solutions: BTreeMap<EntryKey
             let pair = if from <= to { (from, to) } else { (to, from) };
             let counts = withdrawn.is_none() && judged.insert(pair);
             let (accepted, pose, reason, message, numbers) = match outcome {
-                LoopOutcome::Accepted { from_from_to, numbers, .. } => (true, Some(from_from_to.into()), None, None, numbers),
+                LoopOutcome::Accepted { from_from_to, numbers, .. } => {
+                    (true, Some(from_from_to.into()), None, None, numbers)
+                }
                 LoopOutcome::Rejected { reason, message, numbers } => {
                     (false, None, Some(reason.clone()), Some(message.clone()), numbers)
                 }
@@ -268,7 +276,7 @@ fn loops(entries: &BTreeMap<EntryKey, Payload>, mut solutions: BTreeMap<EntryKey
 mod tests {
     use super::*;
     use coma_geometry::{Epoch, Matrix6};
-    use coma_slam::log::LoopWithdrawn;
+    use coma_wire::entries::LoopWithdrawn;
 
     fn key(agent: &str, sequence: u64) -> EntryKey {
         EntryKey { agent: AgentId::new(agent).unwrap(), epoch: Epoch(1), sequence }

@@ -74,7 +74,10 @@ pub struct MapQuery {
               (status = 413, description = "Too many surfels", body = Problem),
               (status = 502, description = "An agent does not answer", body = Problem),
               (status = 503, description = "Too much under work", body = Problem)))]
-pub async fn ply(State(gateway): State<Arc<Gateway>>, Asked(query): Asked<MapQuery>) -> Result<Response, ApiError> {
+pub async fn ply(
+    State(gateway): State<Arc<Gateway>>,
+    Asked(query): Asked<MapQuery>,
+) -> Result<Response, ApiError> {
     let map = query.map.map(|map| map_id("map", &map)).transpose()?;
     let scene = scene::scene(&gateway.directory, map).await?;
     let placed = scene::load(&gateway.directory, &gateway.cache, &scene, gateway.config.max_surfels).await?;
@@ -158,7 +161,11 @@ fn relate(
             return Err(format!("no result of the graph has the first submap of {}", map_text(map)));
         }
     }
-    Err(format!("{} and {} are not joined: no accepted loops tie them together", map_text(old), map_text(new)))
+    Err(format!(
+        "{} and {} are not joined: no accepted loops tie them together",
+        map_text(old),
+        map_text(new)
+    ))
 }
 
 #[cfg(test)]

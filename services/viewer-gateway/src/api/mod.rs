@@ -68,7 +68,10 @@ impl Gateway {
     ) -> Result<T, ApiError> {
         let places: [OwnedSemaphorePermit; 2] = [
             self.heavy_or_waiting.clone().try_acquire_owned().map_err(|_| {
-                ApiError::busy(format!("{} renderings and maps are under work or wait", 2 * self.config.max_heavy))
+                ApiError::busy(format!(
+                    "{} renderings and maps are under work or wait",
+                    2 * self.config.max_heavy
+                ))
             })?,
             self.heavy.clone().acquire_owned().await.map_err(|e| ApiError::internal(e.to_string()))?,
         ];
@@ -146,7 +149,9 @@ pub fn router(gateway: Arc<Gateway>) -> Router {
     let open = Router::new()
         .route("/healthz", get(health::healthz))
         .route("/readyz", get(health::readyz))
-        .fallback_service(tower::ServiceBuilder::new().layer(CompressionLayer::new()).service(get(elsewhere)));
+        .fallback_service(
+            tower::ServiceBuilder::new().layer(CompressionLayer::new()).service(get(elsewhere)),
+        );
     protected
         .merge(open)
         .method_not_allowed_fallback(wrong_method)
@@ -161,7 +166,8 @@ async fn elsewhere(request: Request) -> Response {
         Some(file) => file,
         None => {
             let path: String = request.uri().path().chars().take(100).collect();
-            ApiError::not_found("path", format!("{path} is not served here; see /api/v1/openapi.json")).into_response()
+            ApiError::not_found("path", format!("{path} is not served here; see /api/v1/openapi.json"))
+                .into_response()
         }
     }
 }

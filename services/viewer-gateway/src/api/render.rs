@@ -102,7 +102,15 @@ impl From<RenderQuery> for RenderRequest {
         let (cx, cy) = (q.cx.unwrap_or(middle(width)), q.cy.unwrap_or(middle(height)));
         RenderRequest {
             map: q.map,
-            map_from_camera: Pose { tx_m: q.tx_m, ty_m: q.ty_m, tz_m: q.tz_m, qx: q.qx, qy: q.qy, qz: q.qz, qw: q.qw },
+            map_from_camera: Pose {
+                tx_m: q.tx_m,
+                ty_m: q.ty_m,
+                tz_m: q.tz_m,
+                qx: q.qx,
+                qy: q.qy,
+                qz: q.qz,
+                qw: q.qw,
+            },
             camera: Camera { width, height, fx, fy: q.fy.unwrap_or(fx), cx, cy },
             output: q.output,
             format: q.format,
@@ -153,7 +161,10 @@ async fn render(
     let map_from_camera = map_from_camera.read(&At::Root(pose_at))?;
     let Camera { width, height, fx, fy, cx, cy } = camera;
     let camera = Intrinsics { width, height, fx, fy, cx, cy }.validated().map_err(|e| {
-        ApiError::bad(&format!("{camera_at}{}", e.field), format!("{} is out of range: {}", e.value, e.needed))
+        ApiError::bad(
+            &format!("{camera_at}{}", e.field),
+            format!("{} is out of range: {}", e.value, e.needed),
+        )
     })?;
     let limit = gateway.config.max_render_pixels;
     if camera.pixels() > limit {
@@ -163,7 +174,8 @@ async fn render(
     let scene = scene::scene(&gateway.directory, map).await?;
     let parts = scene::load(&gateway.directory, &gateway.cache, &scene, gateway.config.max_surfels).await?;
     let draw = move || {
-        picture(&parts, &map_from_camera, &camera, output, format).map_err(|e| ApiError::internal(e.to_string()))
+        picture(&parts, &map_from_camera, &camera, output, format)
+            .map_err(|e| ApiError::internal(e.to_string()))
     };
     let file = gateway.heavy(draw).await?;
     let headers = [

@@ -61,6 +61,7 @@ pub enum SurfelFormat {
 #[serde(deny_unknown_fields, default)]
 pub struct SurfelsQuery {
     /// Packed bytes or PLY.
+    #[param(inline)]
     pub format: SurfelFormat,
     /// The revision that the caller knows of: a closed submap in that revision is answered without asking its
     /// agent, and may be kept by the caller for good.
@@ -112,10 +113,14 @@ pub async fn surfels(
         SurfelFormat::Packed => surfels.packed.clone(),
         SurfelFormat::Ply => {
             let write = move || {
-                let unpacked = surfels.surfels(max_surfels).map_err(|e| ApiError::agent(format!("surfels: {e}")))?;
+                let unpacked =
+                    surfels.surfels(max_surfels).map_err(|e| ApiError::agent(format!("surfels: {e}")))?;
                 Ok(Bytes::from(coma_surfel::ply::write(&unpacked)))
             };
-            out.insert(header::CONTENT_DISPOSITION, HeaderValue::from_static("attachment; filename=\"submap.ply\""));
+            out.insert(
+                header::CONTENT_DISPOSITION,
+                HeaderValue::from_static("attachment; filename=\"submap.ply\""),
+            );
             gateway.heavy(write).await?
         }
     };

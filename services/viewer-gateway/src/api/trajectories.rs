@@ -63,7 +63,8 @@ pub async fn trajectories(
         return Ok(Json(Trajectories { trajectories, unreachable: Vec::new() }));
     }
     let whole = gateway.directory.ask(async |link: Arc<Link>| link.trajectory(first, limit).await).await;
-    let trajectories = whole.answers.into_iter().map(|(agent, poses)| Trajectory { agent: agent.to_string(), poses });
+    let trajectories =
+        whole.answers.into_iter().map(|(agent, poses)| Trajectory { agent: agent.to_string(), poses });
     Ok(Json(Trajectories { trajectories: trajectories.collect(), unreachable: whole.unreachable }))
 }
 
@@ -75,7 +76,10 @@ pub async fn trajectories(
     responses((status = 200, description = "The trajectory", body = String, content_type = "text/plain"),
               (status = 404, description = "No such agent", body = Problem),
               (status = 502, description = "The agent does not answer", body = Problem)))]
-pub async fn tum(State(gateway): State<Arc<Gateway>>, Path(agent): Path<String>) -> Result<Response, ApiError> {
+pub async fn tum(
+    State(gateway): State<Arc<Gateway>>,
+    Path(agent): Path<String>,
+) -> Result<Response, ApiError> {
     let agent = agent_id("agent", &agent)?;
     let link = gateway.directory.agent("agent", &agent)?;
     let poses = link.trajectory(0, gateway.config.max_poses).await.map_err(|e| failed(&agent, &e))?;
