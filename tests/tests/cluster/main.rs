@@ -9,7 +9,7 @@ use story::{Cast, Walk};
 #[tokio::test(flavor = "multi_thread")]
 async fn two_agents_that_see_the_same_places_end_with_one_map() {
     let cast = Cast::start(&["agent-00", "agent-01"]).await;
-    let walks = [Walk { first_frame: 0, frames: 90 }, Walk { first_frame: 10, frames: 90 }];
+    let walks = [Walk { first_frame: 0, frames: 65 }, Walk { first_frame: 10, frames: 65 }];
     cast.stream(&walks).await;
     cast.drained().await;
 

@@ -18,7 +18,8 @@ const PATIENCE: Duration = Duration::from_secs(240);
 const MAX_MESSAGE_BYTES: usize = 16 << 20;
 
 static WORLD: LazyLock<World> = LazyLock::new(|| {
-    World::new(WorldSettings { frames: 400, ..Default::default() }).expect("sound settings")
+    World::new(WorldSettings { frames: 400, width: 240, height: 180, ..Default::default() })
+        .expect("sound settings")
 });
 
 /// Where the camera of the walk is.
