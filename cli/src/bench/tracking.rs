@@ -81,7 +81,7 @@ fn one(source: Source, settings: &SlamSettings, arguments: &Arguments) -> anyhow
     let mut found: Vec<(usize, Pose)> = Vec::new();
     let (mut lost, mut degraded, mut submaps, mut surfels) = (0, 0, 0, 0);
     let (mut decode_s, mut track_s, mut map_s, mut totals_s) = (0.0, 0.0, 0.0, Vec::new());
-    let mut csv = String::from("frame,state,share,x,y,z,track_ms,map_ms,added,new_share,steps,hits,loss_l1,loss_ssim,loss_depth,gain,offset,submap\n");
+    let mut csv = String::from("frame,state,share,x,y,z,track_ms,map_ms,added,new_share,steps,hits,loss_l1,loss_ssim,loss_depth,gain,submap\n");
     for index in 0..sequence.len() {
         let begin = Instant::now();
         let frame = Arc::new(coma_dataset::sequence::rgbd_frame(sequence, index)?);
@@ -118,9 +118,9 @@ fn one(source: Source, settings: &SlamSettings, arguments: &Arguments) -> anyhow
             let loss = m.loss.unwrap_or_default();
             writeln!(
                 csv,
-                "{index},{state:?},{:.4},{:.5},{:.5},{:.5},{:.1},{:.1},{},{:.4},{},{},{:.5},{:.4},{:.5},{:.4},{:.4},{}",
+                "{index},{state:?},{:.4},{:.5},{:.5},{:.5},{:.1},{:.1},{},{:.4},{},{},{:.5},{:.4},{:.5},{:.4},{}",
                 outcome.share, t.x, t.y, t.z, (tracked - decoded) * 1e3, (mapped - tracked) * 1e3, m.added, m.new_share,
-                m.steps, m.hits, loss.color_l1, loss.ssim, loss.depth_l1_m, pose.brightness.gain, pose.brightness.offset, pose.submap.number
+                m.steps, m.hits, loss.color_l1, loss.ssim, loss.depth_l1_m, pose.brightness.gain, pose.submap.number
             )?;
         } else {
             writeln!(csv, "{index},{state:?}")?;

@@ -74,6 +74,7 @@ fn score_now(out: &Path, options: &Options) -> anyhow::Result<()> {
     let evaluation = coma_evaluation::evaluate(&RunTrajectories::new(read.tracks()?))?;
     let (pictures, shown) = pictures::score(&read, out, options)?;
     let map = facts.components.first().map(|main| MapSize {
+        submaps: main.submaps,
         surfels: main.surfels,
         bytes: (main.surfels * coma_surfel::pack::SURFEL_BYTES) as u64,
     });

@@ -4,9 +4,9 @@
 pub mod facts;
 mod folder;
 mod g2o;
-mod gather;
+pub mod gather;
 
-pub use folder::{trajectory_name, write_atomically};
+pub use folder::{trajectory_name, write as write_folder, write_atomically};
 
 use crate::cluster::Cluster;
 use crate::collect::{self, AgentCalls};
@@ -75,8 +75,10 @@ pub struct Options {
 /// Runs it.
 pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
     make_empty(&arguments.out)?;
-    let run = Run::start(arguments.specs, &arguments.options, &arguments.out).await?;
-    run.finish(&arguments.options, &arguments.out).await
+    let mut run = Run::start(arguments.specs, &arguments.options, &arguments.out).await?;
+    run.finish(&arguments.options, &arguments.out).await?;
+    run.cluster.shutdown().await;
+    Ok(())
 }
 
 /// Agents that are about to be fed.
@@ -129,8 +131,8 @@ impl Run {
         Ok(Run { cluster, sources, faults, facts })
     }
 
-    /// Streams everything, waits until the agents agree, and writes the folder with its scores.
-    pub async fn finish(mut self, options: &Options, out: &Path) -> anyhow::Result<()> {
+    /// Streams everything, waits until the agents agree, and writes the folder with its scores. The agents go on.
+    pub async fn finish(&mut self, options: &Options, out: &Path) -> anyhow::Result<()> {
         let (begin, cpu) = (Instant::now(), cpu_seconds());
         self.facts.started = rfc3339(SystemTime::now());
         let stamps: Vec<Vec<StampNs>> =
@@ -162,7 +164,6 @@ impl Run {
         let graph = calls.first_mut().context("no agents")?.graph().await?;
         let results = gather::gather(&mut self.facts, &from_agents, &graph, &stamps)?;
         folder::write(out, &self.facts, &results, &texts)?;
-        self.cluster.shutdown().await;
         eval::score(out, &eval::Options { lpips_model: options.lpips_model.clone(), ..eval::Options::default() }).await
     }
 

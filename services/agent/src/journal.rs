@@ -24,7 +24,6 @@ struct KeptPose {
     agent_from_camera: coma_geometry::Pose,
     covariance: Matrix6<f64>,
     gain: f64,
-    offset: f64,
 }
 
 /// A closed submap and everything since the one before.
@@ -151,7 +150,6 @@ impl From<&Checkpoint> for KeptCheckpoint {
             agent_from_camera: p.agent_from_camera,
             covariance: p.covariance,
             gain: p.brightness.gain,
-            offset: p.brightness.offset,
         });
         KeptCheckpoint {
             session: c.session.clone(),
@@ -172,7 +170,7 @@ impl From<KeptCheckpoint> for Checkpoint {
             submap_from_camera: p.submap_from_camera,
             agent_from_camera: p.agent_from_camera,
             covariance: p.covariance,
-            brightness: Brightness { gain: p.gain, offset: p.offset },
+            brightness: Brightness { gain: p.gain },
         });
         Checkpoint {
             session: k.session,

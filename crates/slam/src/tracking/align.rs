@@ -1,18 +1,16 @@
 //! Dense RGB-D alignment by Gauss-Newton: projective point-to-plane and photometric residuals, robust
-//! weights, and a brightness gain and offset in the same system.
+//! weights, and a brightness gain beside them.
 //!
 //! Park, Zhou, Koltun, "Colored point cloud registration revisited" (2017) for the joint objective;
 //! Kerl, Sturm, Cremers, "Dense visual SLAM for RGB-D cameras" (2013) for weights by residual scale.
 
+use super::rows::{self, Matches, Weights};
 use super::view::{Level, TrackingView};
 use coma_frame::DepthNoise;
-use coma_geometry::{Matrix6, Pose, se3};
-use nalgebra::{SMatrix, SVector, Vector3};
+use coma_geometry::{Matrix6, Pose, Tangent, se3};
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-
-type Matrix8 = SMatrix<f64, 8, 8>;
-type Vector8 = SVector<f64, 8>;
 
 /// How two pictures are aligned.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -58,18 +56,16 @@ impl Default for AlignSettings {
     }
 }
 
-/// Brightness of the reference as a function of the picture's: `gain * intensity + offset`.
+/// Brightness of the reference as a function of the picture's: `gain * intensity`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Brightness {
     /// Factor.
     pub gain: f64,
-    /// Intensity 0..1.
-    pub offset: f64,
 }
 
 impl Default for Brightness {
     fn default() -> Self {
-        Brightness { gain: 1.0, offset: 0.0 }
+        Brightness { gain: 1.0 }
     }
 }
 
@@ -150,12 +146,11 @@ pub fn align(
                 return None;
             }
             scales = system.scales(settings);
-            let (delta, brightness_delta) = system.solve(&pose, initial_reference_from_camera, brightness, settings)?;
+            let delta = system.solve(&pose, initial_reference_from_camera, settings)?;
             // The system perturbs the reference's side: reference_from_camera <- exp(delta) * pose.
             pose = se3::exp(&delta) * pose;
             pose.rotation.renormalize();
-            brightness.gain = (brightness.gain + brightness_delta.gain).clamp(0.2, 5.0);
-            brightness.offset = (brightness.offset + brightness_delta.offset).clamp(-0.5, 0.5);
+            brightness.gain = system.gain().unwrap_or(brightness.gain);
             if !(delta.norm() < 10.0) {
                 return None;
             }
@@ -168,11 +163,10 @@ pub fn align(
     let system = last?.linearise(&pose, brightness, scales);
     let scales = system.scales(settings);
     let to_right = se3::adjoint(&pose);
-    let left = system.hessian.fixed_view::<6, 6>(0, 0).into_owned();
     Some(Alignment {
         reference_from_camera: pose,
         brightness,
-        hessian: to_right.transpose() * left * to_right,
+        hessian: to_right.transpose() * system.hessian * to_right,
         pixels: system.pixels,
         matched: system.matched,
         inliers: system.inliers,
@@ -232,8 +226,12 @@ impl Histogram {
 /// Normal equations and counts; sums run over rows in a fixed order.
 #[derive(Clone)]
 struct System {
-    hessian: Matrix8,
-    gradient: Vector8,
+    hessian: Matrix6,
+    gradient: Tangent,
+    /// Sum over the matched pixels.
+    own_brightness: f64,
+    /// Sum over their partners.
+    reference_brightness: f64,
     pixels: usize,
     matched: usize,
     inliers: usize,
@@ -256,8 +254,11 @@ impl Problem<'_> {
             .par_chunks(ROWS_PER_TASK)
             .map(|rows| {
                 let mut system = System::zero();
+                let mut matches = Matches::default();
                 for y in rows {
-                    self.add_row(*y, pose, brightness, scales, &mut system);
+                    matches.clear();
+                    self.match_row(*y, pose, brightness, &mut matches, &mut system);
+                    system.add_row(&mut matches, scales, self.settings);
                 }
                 system
             })
@@ -265,25 +266,23 @@ impl Problem<'_> {
         parts.into_iter().fold(System::zero(), System::plus)
     }
 
-    fn add_row(&self, y: usize, pose: &Pose, brightness: Brightness, scales: Scales, out: &mut System) {
+    /// Finds the partners of a row's pixels.
+    fn match_row(&self, y: usize, pose: &Pose, brightness: Brightness, matches: &mut Matches, out: &mut System) {
         let camera = &self.view.camera;
         let (inv_fx, inv_fy) = (1.0 / camera.fx as f32, 1.0 / camera.fy as f32);
         let (cx, cy) = (camera.cx as f32, camera.cy as f32);
         let target = self.reference;
         let (rfx, rfy) = (target.camera.fx as f32, target.camera.fy as f32);
         let (rcx, rcy) = (target.camera.cx as f32, target.camera.cy as f32);
+        let (inv_rfx, inv_rfy) = (1.0 / rfx, 1.0 / rfy);
         let rotation = pose.rotation.to_rotation_matrix().matrix().cast::<f32>();
         let translation: Vector3<f32> = pose.translation.vector.cast();
-        let (gain, offset) = (brightness.gain as f32, brightness.offset as f32);
-        let inv_geometric = 1.0 / scales.geometric as f32;
-        let inv_photometric = 1.0 / scales.photometric as f32;
-        let huber = self.settings.huber;
-        let photometric_weight = self.settings.photometric_weight * self.settings.photometric_weight;
+        let gain = brightness.gain as f32;
         let (max_u, max_v) = (target.depth_m.width() as f32 - 2.0, target.depth_m.height() as f32 - 2.0);
-        let mut sums = RowSums { pose: [0.0; 21], pose_gradient: [0.0; 6], full: [0.0; 36], full_gradient: [0.0; 8] };
         let (depth, intensity) = (self.view.depth_m.row(y), self.view.intensity.row(y));
         let normals = self.view.normal.row(y);
         let ray_y = (y as f32 - cy) * inv_fy;
+        let reference = &target.intensity;
         for x in (0..depth.len()).step_by(self.stride) {
             let z = depth[x];
             if !(z > 0.0) {
@@ -307,8 +306,8 @@ impl Problem<'_> {
             }
             let n = Vector3::from(n);
             let q = Vector3::new(
-                (nearest.0 as f32 - rcx) / rfx * z_ref,
-                (nearest.1 as f32 - rcy) / rfy * z_ref,
+                (nearest.0 as f32 - rcx) * inv_rfx * z_ref,
+                (nearest.1 as f32 - rcy) * inv_rfy * z_ref,
                 z_ref,
             );
             let own = self.noise.sigma_m(z);
@@ -323,104 +322,73 @@ impl Problem<'_> {
             if own_normal != Vector3::zeros() && (rotation * own_normal).dot(&n) < 0.5 {
                 continue;
             }
-            out.matched += 1;
-
-            // Point to plane, in units of sigma(z).
+            // Point to plane.
             let inv_sigma = 1.0 / sigma;
             let distance = n.dot(&gap);
-            let r = distance * inv_sigma;
-            out.geometric.add(r.abs());
-            out.distance.add(distance.abs());
-            let scaled = r.abs() * inv_geometric;
-            out.inliers += (scaled < 3.0) as usize;
-            let weight = if scaled <= huber { 1.0 } else { huber / scaled } * inv_geometric * inv_geometric;
-            let moment = p.cross(&n);
-            let j = [n.x, n.y, n.z, moment.x, moment.y, moment.z].map(|v| v * inv_sigma);
-            sums.add_pose(&j, r, weight);
-
-            // Photometric: reference(warped) - (gain * own + offset).
+            // Photometric: reference(warped) - gain * own.
             let (iu, iv) = (u as usize, v as usize);
             let (fu, fv) = (u - iu as f32, v - iv as f32);
-            let i = &target.intensity;
-            let top = i[(iu, iv)] * (1.0 - fu) + i[(iu + 1, iv)] * fu;
-            let bottom = i[(iu, iv + 1)] * (1.0 - fu) + i[(iu + 1, iv + 1)] * fu;
-            let r = top * (1.0 - fv) + bottom * fv - (gain * intensity[x] + offset);
-            out.photometric.add(r.abs());
-            let scaled = r.abs() * inv_photometric;
-            let huber_weight = if scaled <= huber { 1.0 } else { huber / scaled };
-            let weight = huber_weight * inv_photometric * inv_photometric * photometric_weight;
+            let top = reference[(iu, iv)] * (1.0 - fu) + reference[(iu + 1, iv)] * fu;
+            let bottom = reference[(iu, iv + 1)] * (1.0 - fu) + reference[(iu + 1, iv + 1)] * fu;
+            let warped = top * (1.0 - fv) + bottom * fv;
             let g = target.gradient[nearest];
             let (gu, gv) = (g[0] * rfx * inv_z, g[1] * rfy * inv_z);
-            let d = Vector3::new(gu, gv, -(gu * p.x + gv * p.y) * inv_z);
-            let moment = p.cross(&d);
-            sums.add_full(&[d.x, d.y, d.z, moment.x, moment.y, moment.z, -intensity[x], -1.0], r, weight);
-        }
-        sums.flush(out);
-    }
-}
-
-/// Sums over one row in single precision; rows are summed in double.
-struct RowSums {
-    /// Upper triangle of the 6x6 geometric part.
-    pose: [f32; 21],
-    pose_gradient: [f32; 6],
-    /// Upper triangle of the 8x8 photometric part.
-    full: [f32; 36],
-    full_gradient: [f32; 8],
-}
-
-impl RowSums {
-    #[inline]
-    fn add_pose(&mut self, j: &[f32; 6], r: f32, weight: f32) {
-        let mut k = 0;
-        for a in 0..6 {
-            let wa = weight * j[a];
-            self.pose_gradient[a] += wa * r;
-            for b in a..6 {
-                self.pose[k] += wa * j[b];
-                k += 1;
+            for (column, value) in matches.point.iter_mut().zip([p.x, p.y, p.z]) {
+                column.push(value);
             }
-        }
-    }
-
-    #[inline]
-    fn add_full(&mut self, j: &[f32; 8], r: f32, weight: f32) {
-        let mut k = 0;
-        for a in 0..8 {
-            let wa = weight * j[a];
-            self.full_gradient[a] += wa * r;
-            for b in a..8 {
-                self.full[k] += wa * j[b];
-                k += 1;
+            for (column, value) in matches.normal.iter_mut().zip([n.x, n.y, n.z]) {
+                column.push(value);
             }
-        }
-    }
-
-    fn flush(&self, out: &mut System) {
-        fn triangle<const N: usize>(values: &[f32], gradient: &[f32; N], out: &mut System) {
-            let mut k = 0;
-            for a in 0..N {
-                out.gradient[a] += gradient[a] as f64;
-                for b in a..N {
-                    out.hessian[(a, b)] += values[k] as f64;
-                    if a != b {
-                        out.hessian[(b, a)] += values[k] as f64;
-                    }
-                    k += 1;
-                }
+            for (column, value) in matches.slope.iter_mut().zip([gu, gv, -(gu * p.x + gv * p.y) * inv_z]) {
+                column.push(value);
             }
+            matches.inv_sigma.push(inv_sigma);
+            matches.distance.push(distance * inv_sigma);
+            matches.difference.push(warped - gain * intensity[x]);
+            out.own_brightness += intensity[x] as f64;
+            out.reference_brightness += warped as f64;
         }
-        triangle(&self.pose, &self.pose_gradient, out);
-        triangle(&self.full, &self.full_gradient, out);
     }
 }
 
 impl System {
+    /// Adds a row's sums and counts.
+    fn add_row(&mut self, matches: &mut Matches, scales: Scales, settings: &AlignSettings) {
+        self.matched += matches.len();
+        let weights = Weights {
+            inv_geometric: 1.0 / scales.geometric as f32,
+            inv_photometric: 1.0 / scales.photometric as f32,
+            photometric: settings.photometric_weight * settings.photometric_weight,
+            huber: settings.huber,
+        };
+        for i in 0..matches.len() {
+            let distance = matches.distance[i].abs();
+            self.geometric.add(distance);
+            self.distance.add(distance / matches.inv_sigma[i]);
+            self.photometric.add(matches.difference[i].abs());
+            self.inliers += (distance * weights.inv_geometric < 3.0) as usize;
+        }
+        let sums = rows::sum(matches, &weights);
+        let mut k = 0;
+        for a in 0..6 {
+            self.gradient[a] += sums.gradient[a] as f64;
+            for b in a..6 {
+                self.hessian[(a, b)] += sums.hessian[k] as f64;
+                if a != b {
+                    self.hessian[(b, a)] += sums.hessian[k] as f64;
+                }
+                k += 1;
+            }
+        }
+    }
+
     fn zero() -> Self {
         let empty = Histogram([0; BINS]);
         System {
-            hessian: Matrix8::zeros(),
-            gradient: Vector8::zeros(),
+            hessian: Matrix6::zeros(),
+            gradient: Tangent::zeros(),
+            own_brightness: 0.0,
+            reference_brightness: 0.0,
             pixels: 0,
             matched: 0,
             inliers: 0,
@@ -433,6 +401,8 @@ impl System {
     fn plus(mut self, other: System) -> System {
         self.hessian += other.hessian;
         self.gradient += other.gradient;
+        self.own_brightness += other.own_brightness;
+        self.reference_brightness += other.reference_brightness;
         self.pixels += other.pixels;
         self.matched += other.matched;
         self.inliers += other.inliers;
@@ -458,13 +428,8 @@ impl System {
         self.distance.median()
     }
 
-    fn solve(
-        &self,
-        pose: &Pose,
-        initial: &Pose,
-        brightness: Brightness,
-        settings: &AlignSettings,
-    ) -> Option<(coma_geometry::Tangent, Brightness)> {
+    /// The Gauss-Newton step.
+    fn solve(&self, pose: &Pose, initial: &Pose, settings: &AlignSettings) -> Option<Tangent> {
         let (mut hessian, mut gradient) = (self.hessian, self.gradient);
         // The prior counts as CORRELATED_PIXELS residuals, as one effective sample of the pictures does.
         let from_initial = se3::log(&(pose * initial.inverse()));
@@ -474,20 +439,18 @@ impl System {
             hessian[(axis, axis)] += weight;
             gradient[axis] += weight * from_initial[axis];
         }
-        // Gain and offset are pulled to 1 and 0, weakly; the pose is only kept from singularity.
-        let pull = 1e-2 * self.matched as f64;
-        hessian[(6, 6)] += pull;
-        hessian[(7, 7)] += pull;
-        gradient[6] += pull * (brightness.gain - 1.0);
-        gradient[7] += pull * brightness.offset;
-        for i in 0..8 {
+        for i in 0..6 {
             hessian[(i, i)] += 1e-9 * hessian[(i, i)] + 1e-6;
         }
         let step = hessian.cholesky()?.solve(&-gradient);
-        step.iter().all(|v| v.is_finite()).then(|| {
-            let pose = coma_geometry::Tangent::new(step[0], step[1], step[2], step[3], step[4], step[5]);
-            (pose, Brightness { gain: step[6], offset: step[7] })
-        })
+        step.iter().all(|v| v.is_finite()).then_some(step)
+    }
+
+    /// The gain that makes the matched pixels as bright as their partners on average. Least squares would be drawn
+    /// towards 0 by whatever blurs the reference, a little more with every submap.
+    fn gain(&self) -> Option<f64> {
+        let gain = self.reference_brightness / self.own_brightness;
+        (self.own_brightness > 1e-3 * self.matched as f64 && gain.is_finite()).then(|| gain.clamp(0.2, 5.0))
     }
 }
 

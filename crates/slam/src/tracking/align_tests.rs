@@ -56,10 +56,10 @@ fn a_known_motion_is_recovered_below_a_millimetre() {
 }
 
 #[test]
-fn a_change_of_exposure_is_taken_up_by_gain_and_offset() {
+fn a_change_of_exposure_is_taken_up_by_the_gain() {
     let found = align(
         &corner(&Pose::identity(), 1.0, 0.0),
-        &corner(&motion(), 0.8, 0.05),
+        &corner(&motion(), 0.8, 0.0),
         &Pose::identity(),
         Brightness::default(),
         &AlignSettings::default(),
@@ -67,7 +67,7 @@ fn a_change_of_exposure_is_taken_up_by_gain_and_offset() {
     .unwrap();
     let (metres, _) = se3::distance(&found.reference_from_camera, &motion());
     assert!(metres < 1.5e-3, "{metres} m");
-    assert!((found.brightness.gain - 1.25).abs() < 0.05, "{:?}", found.brightness);
+    assert!((found.brightness.gain - 1.25).abs() < 0.01, "{:?}", found.brightness);
 }
 
 #[test]
@@ -139,18 +139,11 @@ fn the_gradient_agrees_with_differences_of_the_frozen_association() {
     let pose = Pose::identity();
     let system = at(&pose, brightness);
     // The objective's own second-order model predicts the gradient at a moved pose: g(d) = g + H d.
-    for axis in [0, 1, 2, 5, 6, 7] {
+    for axis in [0, 1, 2, 5] {
         let step = 1e-3;
-        let (moved, b) = match axis {
-            6 => (pose, Brightness { gain: brightness.gain + step, ..brightness }),
-            7 => (pose, Brightness { offset: brightness.offset + step, ..brightness }),
-            _ => {
-                let mut d = Tangent::zeros();
-                d[axis] = step;
-                (se3::exp(&d) * pose, brightness)
-            }
-        };
-        let difference = (at(&moved, b).gradient - system.gradient) / step;
+        let mut d = Tangent::zeros();
+        d[axis] = step;
+        let difference = (at(&(se3::exp(&d) * pose), brightness).gradient - system.gradient) / step;
         let predicted = system.hessian.column(axis).into_owned();
         let error = (difference - predicted).norm() / predicted.norm();
         assert!(error < 0.05, "axis {axis}: {error}");

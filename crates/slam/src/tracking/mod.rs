@@ -2,6 +2,7 @@
 
 pub mod align;
 pub mod model;
+mod rows;
 pub mod view;
 
 use align::{AlignSettings, Alignment, Brightness, align};
