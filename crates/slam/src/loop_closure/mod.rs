@@ -166,6 +166,17 @@ impl LoopCloser {
         self.to_query.extend(queries);
     }
 
+    /// Place recognition lost what it had: every anchor is inserted again.
+    pub fn insert_all_again(&mut self) {
+        let described = self.submaps.iter().filter(|(_, facts)| facts.anchor.is_some());
+        self.to_insert.extend(described.map(|(id, _)| id.clone()));
+    }
+
+    /// Anchors that were handed out to be inserted.
+    pub fn inserted(&self) -> usize {
+        self.submaps.values().filter(|facts| facts.anchor.is_some()).count() - self.to_insert.len()
+    }
+
     /// Takes candidates; keeps those that have an end here and no verdict.
     pub fn on_candidates(&mut self, candidates: Vec<Candidate>, now_s: f64) {
         for candidate in candidates {
@@ -233,6 +244,11 @@ impl LoopCloser {
     /// True once after entries came that change the graph.
     pub fn take_graph_changed(&mut self) -> bool {
         std::mem::take(&mut self.graph_changed)
+    }
+
+    /// True while entries that change the graph wait to be solved.
+    pub fn graph_changed(&self) -> bool {
+        self.graph_changed
     }
 
     /// Candidates without a verdict that have an end here.

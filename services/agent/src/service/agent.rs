@@ -179,8 +179,8 @@ impl Agent for AgentService {
     async fn drain(&self, _request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>, Status> {
         let node = &self.0;
         let pending_frames = node.queue.pending() as u32;
-        let unfinished = node.unfinished.load(Ordering::SeqCst);
         let knowledge = node.lock();
+        let unfinished = node.unfinished.load(Ordering::SeqCst);
         let heads = knowledge.replica.heads();
         let pending_candidates = knowledge.closer.pending() as u32;
         let mut waiting_for = Vec::new();
@@ -192,6 +192,7 @@ impl Agent for AgentService {
         wait(pending_frames > 0, format!("{pending_frames} frames to be tracked and mapped"));
         wait(knowledge.closer.unqueried() > 0, format!("{} places to be looked up", knowledge.closer.unqueried()));
         wait(pending_candidates > 0, format!("{pending_candidates} candidates to be verified"));
+        wait(knowledge.closer.graph_changed(), "the graph to be solved".into());
         wait(unfinished > 0, format!("{unfinished} pieces of work under way"));
         for peer in knowledge.peers.values().filter(|p| p.alive && p.heads != heads) {
             if let Some(agent) = &peer.agent {

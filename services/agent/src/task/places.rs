@@ -87,12 +87,12 @@ fn describe_request(frame: &RgbdFrame) -> anyhow::Result<v1::DescribeRequest> {
 /// Keeps the index up with the logs, and looks up every new anchor, own or others'.
 pub async fn index(node: Arc<Node>, mut client: Client) {
     loop {
+        // Counted from before they are taken, so that a drain never sees neither.
+        let unfinished = Unfinished::begin(&node);
         let (inserts, queries) = {
             let mut knowledge = node.lock();
-            let _unfinished = Unfinished::begin(&node);
             (knowledge.closer.take_inserts(), knowledge.closer.take_queries())
         };
-        let unfinished = Unfinished::begin(&node);
         if inserts.is_empty() && queries.is_empty() {
             drop(unfinished);
             node.places_wake.notified().await;
@@ -108,12 +108,20 @@ pub async fn index(node: Arc<Node>, mut client: Client) {
             if let Err(e) = query(&node, &mut client, submap).await {
                 debug!(error = %format!("{e:#}"), "place recognition did not answer a query yet");
                 node.lock().closer.retry(Vec::new(), queries[i..].to_vec());
+                if is_not_found(&e) {
+                    node.lock().closer.insert_all_again();
+                }
                 tokio::time::sleep(RETRY).await;
                 break;
             }
         }
         node.verify_wake.notify_one();
     }
+}
+
+/// The index or the anchor is gone: the service started anew.
+fn is_not_found(error: &anyhow::Error) -> bool {
+    error.downcast_ref::<tonic::Status>().is_some_and(|status| status.code() == tonic::Code::NotFound)
 }
 
 async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyhow::Result<()> {
@@ -130,9 +138,15 @@ async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyho
         };
         (knowledge.agent.to_string(), submaps.iter().filter_map(anchor).collect::<Vec<_>>())
     };
+    let mut held = None;
     for chunk in anchors.chunks(256) {
         let request = v1::InsertRequest { index: index.clone(), anchors: chunk.to_vec() };
-        client.insert(request).await?;
+        held = Some(client.insert(request).await?.into_inner().anchors_in_index);
+    }
+    let mut knowledge = node.lock();
+    if held.is_some_and(|held| held < knowledge.closer.inserted() as u64) {
+        debug!(held, "place recognition started anew: it is given all anchors again");
+        knowledge.closer.insert_all_again();
     }
     Ok(())
 }

@@ -17,43 +17,63 @@ const RETRY: Duration = Duration::from_millis(500);
 /// Entries in one call.
 const CHUNK: usize = 512;
 
+/// What dpgo was given.
+#[derive(Default)]
+struct Given {
+    graph: String,
+    have: VersionVector,
+}
+
 /// Solves after every change of the graph.
 pub async fn run(node: Arc<Node>, mut client: DpgoClient<Channel>) {
-    // What this dpgo has of the logs; forgotten when it restarts.
-    let mut have = VersionVector::new();
+    let mut given = Given::default();
     loop {
+        // Counted from before it is taken, so that a drain never sees neither.
+        let unfinished = Unfinished::begin(&node);
         if !node.lock().closer.take_graph_changed() {
+            drop(unfinished);
             node.solve_wake.notified().await;
             continue;
         }
-        let _unfinished = Unfinished::begin(&node);
         tokio::time::sleep(GATHER).await;
         node.lock().closer.take_graph_changed();
-        loop {
-            match solve(&node, &mut client, &mut have).await {
-                Ok(()) => break,
-                Err(e) => {
-                    debug!(error = %format!("{e:#}"), "the graph could not be solved yet");
-                    have.clear();
-                    tokio::time::sleep(RETRY).await;
-                }
+        let mut failed = false;
+        while let Err(e) = solve(&node, &mut client, &mut given).await {
+            let error = format!("{e:#}");
+            if failed {
+                debug!(error, "the graph could not be solved yet");
+            } else {
+                warn!(error, "the graph could not be solved; tried again until it is");
             }
+            failed = true;
+            // A dpgo that started anew has nothing.
+            given.have.clear();
+            tokio::time::sleep(RETRY).await;
         }
     }
 }
 
-async fn solve(node: &Node, client: &mut DpgoClient<Channel>, have: &mut VersionVector) -> anyhow::Result<()> {
-    let (graph, entries, heads) = {
+async fn solve(node: &Node, client: &mut DpgoClient<Channel>, given: &mut Given) -> anyhow::Result<()> {
+    let (entries, heads) = {
         let knowledge = node.lock();
-        let missing: Vec<v1::Entry> = knowledge.replica.missing(have, usize::MAX).map(Wire::to_wire).collect();
-        (knowledge.agent.to_string(), missing, knowledge.replica.heads())
+        // A log that forked gets shorter, which a graph does not: it is put anew, under another name.
+        let graph = match knowledge.replica.conflicts().count() {
+            0 => knowledge.agent.to_string(),
+            conflicts => format!("{}.{conflicts}", knowledge.agent),
+        };
+        if given.graph != graph {
+            *given = Given { graph, have: VersionVector::new() };
+        }
+        let missing: Vec<v1::Entry> =
+            knowledge.replica.missing(&given.have, usize::MAX).map(Wire::to_wire).collect();
+        (missing, knowledge.replica.heads())
     };
     for chunk in entries.chunks(CHUNK) {
-        let request = v1::PutEntriesRequest { graph: graph.clone(), entries: chunk.to_vec() };
+        let request = v1::PutEntriesRequest { graph: given.graph.clone(), entries: chunk.to_vec() };
         let response = client.put_entries(request).await?.into_inner();
-        *have = coma_wire::version_vector(response.have, &At::Root("have"))?;
+        given.have = coma_wire::version_vector(response.have, &At::Root("have"))?;
     }
-    let request = v1::SolveRequest { graph, at_least: Some(heads.to_wire()) };
+    let request = v1::SolveRequest { graph: given.graph.clone(), at_least: Some(heads.to_wire()) };
     let response = client.solve(request).await?.into_inner();
     let at = At::Root("components");
     let mut corrections = Vec::new();
