@@ -58,7 +58,7 @@ fn decode_depth(data: &DepthData, calibration: &Calibration) -> Result<Image<f32
             other => return Err(refuse(format!("is a {:?} PNG, 16-bit grey is needed", other.color()))),
         },
         DepthData::Coma(bytes) => {
-            let limits = coma_depth_codec::Limits { max_pixels: camera.pixels(), ..Default::default() };
+            let limits = coma_depth_codec::Limits { max_pixels: camera.pixels() };
             let decoded = coma_depth_codec::decode(bytes, limits).map_err(|e| refuse(e.to_string()))?;
             if decoded.depth_m.width() != width as usize || decoded.depth_m.height() != height as usize {
                 let (w, h) = (decoded.depth_m.width(), decoded.depth_m.height());

@@ -75,7 +75,7 @@ impl Level {
 pub fn to_view(name: &Evidence, blob: Bytes) -> Result<View, FieldError> {
     let blob = decode_evidence(name, blob)?;
     let camera = blob.camera;
-    let limits = coma_depth_codec::Limits { max_pixels: camera.pixels(), ..Default::default() };
+    let limits = coma_depth_codec::Limits { max_pixels: camera.pixels() };
     let decoded = coma_depth_codec::decode(&blob.depth, limits)
         .map_err(|e| FieldError::new("blob.depth", e.to_string()))?;
     if decoded.depth_m.width() != camera.width as usize || decoded.depth_m.height() != camera.height as usize {
