@@ -1,5 +1,6 @@
 //! Agents and their services in one process, over gRPC on loopback, in the built-in world.
 
+#[allow(dead_code, reason = "each scenario uses its part of the story")]
 mod story;
 
 use coma_geometry::se3;

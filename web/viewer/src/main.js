@@ -19,7 +19,7 @@ const coma = {
   view,
   /** By submap: how often its surfels were downloaded. */
   downloads: {},
-  corrections: 0,
+  on,
   get counts() {
     const trajectories = {};
     for (const [agent, poses] of state.poses) trajectories[agent] = poses.length;
@@ -147,7 +147,6 @@ function on(event) {
       getSurfels();
       return redraw();
     case "correction":
-      coma.corrections++;
       state.correct(event.component);
       redraw();
       // Submaps after the cut are placed by their agent, and the graph has new weights.

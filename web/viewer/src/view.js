@@ -90,6 +90,19 @@ export class View {
     return this.#surfels.get(id)?.revision;
   }
 
+  /** Where a submap's surfels are drawn, in their map. */
+  surfelMatrix(id) {
+    return this.#surfels.get(id)?.object.matrix;
+  }
+
+  /** A submap's first surfel as the graphics card has it: centre, rotation x y z w, scales, colour and opacity. */
+  firstSurfel(id) {
+    const { geometry } = this.#surfels.get(id).object;
+    const columns = { center: 3, rotation: 4, scale: 2, surfelColor: 4 };
+    const read = (name) => Array.from({ length: columns[name] }, (_, k) => geometry.getAttribute(name).getComponent(0, k));
+    return { center: read("center"), rotation: read("rotation"), scale: read("scale"), color: read("surfelColor") };
+  }
+
   get surfels() {
     return [...this.#surfels.values()].reduce((sum, { object }) => sum + object.userData.surfels, 0);
   }
