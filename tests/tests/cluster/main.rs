@@ -38,3 +38,27 @@ async fn two_agents_that_see_the_same_places_end_with_one_map() {
     }
     cast.shutdown().await;
 }
+
+/// Whatever place-recognition and dpgo held is given to them again, without anyone asking for it.
+#[tokio::test(flavor = "multi_thread")]
+async fn services_that_start_anew_are_given_again_what_they_had() {
+    let mut cast = Cast::start(&["agent-00"]).await;
+    cast.stream(&[Walk { first_frame: 0, frames: 30 }]).await;
+    cast.drained().await;
+    let before = cast.submaps(0).await;
+    assert!(before.len() >= 2, "{before:?}");
+
+    cast.restart_services().await;
+    assert!(cast.solve(0).await.is_err(), "nothing is left");
+    cast.stream(&[Walk { first_frame: 30, frames: 25 }]).await;
+    cast.drained().await;
+    let submaps = cast.submaps(0).await;
+    assert!(submaps.len() > before.len());
+    for submap in submaps {
+        let id = submap.id.unwrap();
+        assert!(cast.is_indexed("agent-00", id.clone()).await, "{id:?} is not in the index");
+    }
+    let solved = cast.solve(0).await.expect("the graph is there");
+    assert_eq!(solved.components, cast.graph(0).await.components);
+    cast.shutdown().await;
+}

@@ -3,9 +3,13 @@
 use coma_agent::AgentConfig;
 use coma_dataset::world::{World, WorldSettings};
 use coma_dataset::{ColorBytes, DepthBytes, Sequence};
+use coma_dpgo::DpgoConfig;
 use coma_geometry::{AgentId, Intrinsics, Pose, StampNs};
+use coma_place_recognition::PlaceRecognitionConfig;
 use coma_runtime::{ByteLedger, Channel, Class, channel};
 use coma_wire::v1::agent_client::AgentClient;
+use coma_wire::v1::dpgo_client::DpgoClient;
+use coma_wire::v1::place_recognition_client::PlaceRecognitionClient;
 use coma_wire::v1::stream_frames_response::Event;
 use coma_wire::v1::viewer_client::ViewerClient;
 use coma_wire::{At, Calibration, ColorData, DepthData, EncodedFrame, Limited, Wire, encode_frame, v1};
@@ -116,6 +120,42 @@ impl Cast {
         Cast { agents, channels, place_recognition, dpgo, _data: data }
     }
 
+    /// Both services end, forget everything, and start anew at the same addresses.
+    pub async fn restart_services(&mut self) {
+        let mut config = PlaceRecognitionConfig::default();
+        config.server.listen = self.place_recognition.local_addr;
+        let fresh = coma_place_recognition::Server::start(PlaceRecognitionConfig::default()).await.unwrap();
+        std::mem::replace(&mut self.place_recognition, fresh).shutdown().await;
+        self.place_recognition = coma_place_recognition::Server::start(config).await.unwrap();
+        let mut config = DpgoConfig::default();
+        config.server.listen = self.dpgo.local_addr;
+        let fresh = coma_dpgo::Server::start(DpgoConfig::default()).await.unwrap();
+        std::mem::replace(&mut self.dpgo, fresh).shutdown().await;
+        self.dpgo = coma_dpgo::Server::start(config).await.unwrap();
+    }
+
+    /// True if place recognition holds an anchor for this agent.
+    pub async fn is_indexed(&self, agent: &str, submap_id: v1::SubmapId) -> bool {
+        let request = v1::QueryRequest { index: agent.into(), submap_id: Some(submap_id), limit: 1 };
+        let url = &self.place_recognition.url;
+        let to_place = channel(url, &Default::default(), &ByteLedger::default(), Class::Local).unwrap();
+        PlaceRecognitionClient::new(to_place).query(request).await.is_ok()
+    }
+
+    /// What dpgo makes of everything that this agent knows.
+    pub async fn solve(&self, index: usize) -> Result<v1::SolveResponse, tonic::Status> {
+        let status = self.agent(index).get_status(v1::GetStatusRequest {}).await?.into_inner();
+        let request = v1::SolveRequest { graph: status.agent_id, at_least: status.heads };
+        let url = &self.dpgo.url;
+        let to_dpgo = channel(url, &Default::default(), &ByteLedger::default(), Class::Local).unwrap();
+        Ok(DpgoClient::new(to_dpgo).solve(request).await?.into_inner())
+    }
+
+    /// This agent's submaps.
+    pub async fn submaps(&self, index: usize) -> Vec<v1::SubmapInfo> {
+        self.viewer(index).list_submaps(v1::ListSubmapsRequest {}).await.unwrap().into_inner().submaps
+    }
+
     fn agent(&self, index: usize) -> AgentClient<Channel> {
         AgentClient::new(self.channels[index].clone()).limited(MAX_MESSAGE_BYTES)
     }
@@ -188,7 +228,7 @@ impl Cast {
 
 async fn play(mut client: AgentClient<Channel>, walk: Walk) {
     let request = v1::OpenSessionRequest {
-        session_id: "walk".into(),
+        session_id: format!("walk-{}", walk.first_frame),
         calibration: Some(walk.calibration().to_wire()),
         policy: v1::QueuePolicy::Block.into(),
         clock_domain: v1::ClockDomain::Device.into(),

@@ -36,9 +36,10 @@ try {
   };
   await page.waitForFunction(complete, { timeout: 280_000, polling: 200 }, Number(frames));
   await page.evaluate(() => window.coma.view.fit());
-  await page.click("#render");
-  await page.waitForFunction(() => document.getElementById("rendering").complete && document.getElementById("rendering").naturalWidth > 0, { timeout: 60_000 });
   const settled = () => page.evaluate(() => new Promise((done) => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(done)), 300)));
+  await settled();
+  await page.click("#render");
+  await page.waitForFunction(() => document.getElementById("picture").complete && document.getElementById("picture").naturalWidth > 0, { timeout: 60_000 });
   await settled();
   await page.screenshot({ path: picture });
 

@@ -96,8 +96,10 @@ async fn solve(node: &Node, client: &mut DpgoClient<Channel>, given: &mut Given)
     }
     let joined = corrections.len();
     knowledge.corrections.replace(corrections);
-    for rejected in &response.rejected_entries {
-        warn!(key = ?rejected.key, message = %rejected.message, "an entry is not used in the graph");
+    let is_new = |rejected: &&v1::RejectedEntry| !knowledge.solved.rejected_entries.contains(rejected);
+    for rejected in response.rejected_entries.iter().filter(is_new) {
+        // Two agents may decide one pair: expected, and harmless.
+        debug!(key = ?rejected.key, message = %rejected.message, "an entry is not used in the graph");
     }
     knowledge.solved = response.clone();
     for digest in digests {
