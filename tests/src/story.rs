@@ -4,7 +4,7 @@ use coma_agent::AgentConfig;
 use coma_dataset::world::{World, WorldSettings};
 use coma_dataset::{ColorBytes, DepthBytes, Sequence};
 use coma_dpgo::DpgoConfig;
-use coma_geometry::{AgentId, Pose};
+use coma_geometry::{AgentId, Intrinsics, Pose, StampNs};
 use coma_place_recognition::PlaceRecognitionConfig;
 use coma_runtime::{ByteLedger, Channel, Class, channel};
 use coma_wire::v1::agent_client::AgentClient;
@@ -31,6 +31,19 @@ pub fn truth(frame: usize) -> Pose {
     WORLD.sequence(0).expect("a walk").truth(frame).expect("the world knows")
 }
 
+/// What it sees there: RGB, row by row.
+pub fn picture(frame: usize) -> Vec<u8> {
+    match WORLD.sequence(0).expect("a walk").frame(frame).expect("a frame").color {
+        ColorBytes::Rgb8(image) => image.into_pixels().into_flattened(),
+        _ => unreachable!("the built-in world films in RGB"),
+    }
+}
+
+/// The camera itself.
+pub fn camera() -> Intrinsics {
+    WORLD.sequence(0).expect("a walk").calibration().color
+}
+
 /// A stretch of the built-in world's first walk.
 #[derive(Clone, Copy)]
 pub struct Walk {
@@ -41,6 +54,11 @@ pub struct Walk {
 }
 
 impl Walk {
+    /// The stamp of its `index`-th frame.
+    pub fn stamp(&self, index: usize) -> StampNs {
+        WORLD.sequence(0).expect("a walk").stamp(self.first_frame + index)
+    }
+
     /// What a session is told of the camera.
     pub fn calibration(&self) -> Calibration {
         let sequence = WORLD.sequence(0).expect("a walk");
@@ -160,6 +178,11 @@ impl Cast {
 
     fn viewer(&self, index: usize) -> ViewerClient<Channel> {
         ViewerClient::new(self.channels[index].clone()).limited(MAX_MESSAGE_BYTES)
+    }
+
+    /// Where the agents serve.
+    pub fn urls(&self) -> Vec<String> {
+        self.agents.iter().map(|agent| agent.url.clone()).collect()
     }
 
     /// Every agent gets its walk, at the same time; returns when all frames are processed.

@@ -110,7 +110,7 @@ async fn frames_that_make_no_sense_are_refused_by_field_and_the_stream_goes_on()
 async fn unknown_sessions_and_messages_over_the_limit_end_the_call_and_nothing_else() {
     let cast = Cast::start(&["agent-00"]).await;
     let mut agent = cast.agent(0);
-    let mut one = |session_id: &str, frame: v1::Frame| {
+    let one = |session_id: &str, frame: v1::Frame| {
         let message = v1::StreamFramesRequest { session_id: session_id.into(), frame: Some(frame) };
         let mut agent = agent.clone();
         async move {

@@ -1,6 +1,6 @@
 use super::*;
 use coma_frame::DepthNoise;
-use coma_geometry::{Tangent, se3};
+use coma_geometry::{Intrinsics, Tangent, se3};
 use coma_surfel::Surfel;
 use nalgebra::{UnitQuaternion, Vector3};
 use oracle::OraclePixel;
