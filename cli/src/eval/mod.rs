@@ -59,13 +59,16 @@ pub async fn score(out: &Path, options: &Options) -> anyhow::Result<()> {
 }
 
 /// A run as it is read back.
-struct Read {
-    facts: Facts,
-    loops: Vec<LoopFacts>,
-    sources: Vec<Source>,
+pub struct Read {
+    /// What the run did.
+    pub facts: Facts,
+    /// Every candidate.
+    pub loops: Vec<LoopFacts>,
+    /// What the agents saw, in the order of the facts.
+    pub sources: Vec<Source>,
     faults: Vec<Vec<Fault>>,
     /// By agent, then component: frame and `map_from_camera`.
-    tracks: BTreeMap<(usize, usize), Vec<(usize, Pose)>>,
+    pub tracks: BTreeMap<(usize, usize), Vec<(usize, Pose)>>,
 }
 
 fn score_now(out: &Path, options: &Options) -> anyhow::Result<()> {
@@ -112,7 +115,8 @@ fn score_now(out: &Path, options: &Options) -> anyhow::Result<()> {
 }
 
 impl Read {
-    fn open(out: &Path) -> anyhow::Result<Self> {
+    /// Reads the folder that `coma run` wrote; the sequences must lie where they lay then.
+    pub fn open(out: &Path) -> anyhow::Result<Self> {
         let path = out.join("run.json");
         let text = std::fs::read_to_string(&path)
             .with_context(|| format!("{} is no run's folder: run.json can't be read", out.display()))?;
