@@ -33,7 +33,17 @@ fn json(path: &Path) -> serde_json::Value {
 fn help_names_every_command_and_shows_how_to_begin() {
     let help = succeeds(&["--help"]);
     for command in [
-        "demo", "run", "agent", "place-recognition", "dpgo", "gateway", "stream", "eval", "export", "synth", "bench",
+        "demo",
+        "run",
+        "agent",
+        "place-recognition",
+        "dpgo",
+        "gateway",
+        "stream",
+        "eval",
+        "export",
+        "synth",
+        "bench",
     ] {
         assert!(help.lines().any(|l| l.trim_start().starts_with(command)), "{command} is missing in\n{help}");
         assert!(succeeds(&[command, "--help"]).len() > 100, "{command} --help says too little");
@@ -46,8 +56,15 @@ fn a_run_leaves_a_folder_that_can_be_scored_again() {
     let out = folder.path().join("run");
     let shown = out.to_str().unwrap();
     let table = succeeds(&[
-        "run", "left=world:rooms/agent-0[0:26]", "world:rooms/agent-0[10:40:2]", "--out", shown, "--hold-out", "5",
-        "--fault", "left=nodepth:12-13",
+        "run",
+        "left=world:rooms/agent-0[0:26]",
+        "world:rooms/agent-0[10:40:2]",
+        "--out",
+        shown,
+        "--hold-out",
+        "5",
+        "--fault",
+        "left=nodepth:12-13",
     ]);
     assert!(table.contains("ATE RMSE") && table.contains("bytes per frame"), "{table}");
 
@@ -57,7 +74,8 @@ fn a_run_leaves_a_folder_that_can_be_scored_again() {
     assert!(out.join("renders").read_dir().unwrap().count() >= 4);
     // Stamps are the input's, digit for digit; frames without depth have no pose, or are found again.
     let left = std::fs::read_to_string(out.join("trajectories/left.tum")).unwrap();
-    let stamps: Vec<&str> = left.lines().filter(|l| !l.starts_with('#')).map(|l| l.split(' ').next().unwrap()).collect();
+    let stamps: Vec<&str> =
+        left.lines().filter(|l| !l.starts_with('#')).map(|l| l.split(' ').next().unwrap()).collect();
     assert_eq!(stamps[..3], ["0.000000", "0.033333", "0.066667"]);
     assert!((20..=24).contains(&stamps.len()), "{} poses", stamps.len());
     let other = std::fs::read_to_string(out.join("trajectories/agent-01.tum")).unwrap();
@@ -65,7 +83,11 @@ fn a_run_leaves_a_folder_that_can_be_scored_again() {
 
     let first = json(&out.join("report.json"));
     assert!(first["figures"]["protocol_p"]["ate_rmse_m"].as_f64().unwrap() < 0.02, "{}", first["figures"]);
-    assert!(first["figures"]["protocol_h"]["psnr_db"].as_f64().is_some(), "held-out views: {}", first["figures"]);
+    assert!(
+        first["figures"]["protocol_h"]["psnr_db"].as_f64().is_some(),
+        "held-out views: {}",
+        first["figures"]
+    );
     assert!(first["figures"]["bytes_per_frame"].as_f64().unwrap() > 0.0);
     succeeds(&["eval", shown]);
     assert_eq!(json(&out.join("report.json")), first, "scores come from the folder alone");
@@ -83,7 +105,10 @@ fn what_is_wrong_is_said_with_the_name_of_the_file_or_argument() {
         (vec!["run", "tum:does-not-exist", "--out", &out], "does-not-exist"),
         (vec!["run", "movie:x", "--out", &out], "movie"),
         (vec!["run", "world:rooms/agent-0[9:3]", "--out", &out], "9:3"),
-        (vec!["run", "a=world:rooms/agent-0", "a=world:rooms/agent-1", "--out", &out], "two agents are named a"),
+        (
+            vec!["run", "a=world:rooms/agent-0", "a=world:rooms/agent-1", "--out", &out],
+            "two agents are named a",
+        ),
         (vec!["run", "world:rooms/agent-0[0:5]", "--out", &out, "--fault", "fog:1-2"], "fog"),
         (vec!["eval", &out], "run.json"),
         (vec!["stream", "world:rooms/agent-0[0:5]", "--to", "nowhere"], "nowhere"),

@@ -32,7 +32,9 @@ async fn sessions_that_make_no_sense_are_refused_by_field() {
         ("calibration.color.fy", |s| color(s).fy = 0.0),
         ("calibration.color.width", |s| color(s).width = 0),
         ("calibration.color.height", |s| color(s).height = 1 << 30),
-        ("calibration.depth_units_per_metre", |s| s.calibration.as_mut().unwrap().depth_units_per_metre = 0.0),
+        ("calibration.depth_units_per_metre", |s| {
+            s.calibration.as_mut().unwrap().depth_units_per_metre = 0.0
+        }),
         ("session_id", |s| s.session_id = "No Good".into()),
         ("policy", |s| s.policy = 99),
     ];
@@ -55,8 +57,12 @@ async fn frames_that_make_no_sense_are_refused_by_field_and_the_stream_goes_on()
     // Frame 5 is spoilt in each of these ways before it comes as it should be.
     let changes: [(&str, Change); 12] = [
         ("frame.color", |f| f.color = f.color.slice(..100)),
-        ("frame.color", |f| (f.color_encoding, f.color) = (v1::ColorEncoding::Jpeg.into(), f.color.slice(..5000))),
-        ("frame.color", |f| (f.color_encoding, f.color) = (v1::ColorEncoding::Png.into(), Default::default())),
+        ("frame.color", |f| {
+            (f.color_encoding, f.color) = (v1::ColorEncoding::Jpeg.into(), f.color.slice(..5000))
+        }),
+        ("frame.color", |f| {
+            (f.color_encoding, f.color) = (v1::ColorEncoding::Png.into(), Default::default())
+        }),
         ("frame.color_encoding", |f| f.color_encoding = 77),
         ("frame.color_encoding", |f| f.color_encoding = 0),
         ("frame.depth", |f| f.depth = f.depth.slice(2..)),
@@ -129,7 +135,8 @@ async fn unknown_sessions_and_messages_over_the_limit_end_the_call_and_nothing_e
     assert!(one("walk", huge).await.is_err(), "over the limit of 16 MiB");
     one("walk", WALK.message(0)).await.expect("the session is still there");
 
-    let status = agent.close_session(v1::CloseSessionRequest { session_id: "other".into() }).await.unwrap_err();
+    let status =
+        agent.close_session(v1::CloseSessionRequest { session_id: "other".into() }).await.unwrap_err();
     assert_eq!(status.code(), Code::NotFound, "{status}");
     let status = agent.open_session(session("second")).await.unwrap_err();
     assert_eq!(status.code(), Code::FailedPrecondition, "one camera at a time: {status}");
@@ -148,7 +155,8 @@ async fn a_peer_that_cannot_be_reached_is_told_by_name_and_disturbs_nothing() {
     let told = async {
         loop {
             let status = cast.agent(0).get_status(v1::GetStatusRequest {}).await.unwrap().into_inner();
-            if let Some(peer) = status.peers.iter().find(|p| p.endpoint == nobody && !p.last_error.is_empty()) {
+            if let Some(peer) = status.peers.iter().find(|p| p.endpoint == nobody && !p.last_error.is_empty())
+            {
                 return peer.clone();
             }
             tokio::time::sleep(std::time::Duration::from_millis(50)).await;

@@ -29,7 +29,8 @@ async fn a_python_client_streams_recorded_frames_and_reads_poses() {
     assert_eq!(poses.len(), FRAMES);
 
     let truth = tum::parse(&std::fs::read_to_string(kitchen().join("groundtruth.txt")).unwrap()).unwrap();
-    let true_pose = |p: &tum::StampedPose| truth.iter().find(|t| t.stamp == p.stamp).expect("a truth for every stamp");
+    let true_pose =
+        |p: &tum::StampedPose| truth.iter().find(|t| t.stamp == p.stamp).expect("a truth for every stamp");
     let point = |p: &tum::StampedPose| Point3::from(p.pose.translation.vector);
     let estimated: Vec<_> = poses.iter().map(point).collect();
     let real: Vec<_> = poses.iter().map(|p| point(true_pose(p))).collect();

@@ -29,14 +29,21 @@ pub fn sheet(from: &RgbdFrame, to: &RgbdFrame, from_from_to: Option<&Pose>) -> R
         let above = Eye::above(first.iter().chain(&second), TILE, height);
         for (column, eye) in [ahead, above].iter().enumerate() {
             let (a, b) = (seen(&first, eye, TILE, height), seen(&second, eye, TILE, height));
-            imageops::replace(&mut out, &together(&a, &b), column as i64 * i64::from(TILE), i64::from(height));
+            imageops::replace(
+                &mut out,
+                &together(&a, &b),
+                column as i64 * i64::from(TILE),
+                i64::from(height),
+            );
         }
     }
     out
 }
 
 fn picture(color: &Image<[u8; 3]>, height: u32) -> RgbImage {
-    let whole = RgbImage::from_fn(color.width() as u32, color.height() as u32, |x, y| Rgb(color[(x as usize, y as usize)]));
+    let whole = RgbImage::from_fn(color.width() as u32, color.height() as u32, |x, y| {
+        Rgb(color[(x as usize, y as usize)])
+    });
     imageops::resize(&whole, TILE, height, imageops::FilterType::Triangle)
 }
 
@@ -109,7 +116,9 @@ impl Eye {
     /// Pixel and distance from the eye.
     fn look(&self, p: &Point3<f64>) -> Option<(f64, f64, f64)> {
         match self {
-            Eye::Camera(camera) => camera.project(p).filter(|_| p.z > 0.05).map(|pixel| (pixel.x, pixel.y, p.z)),
+            Eye::Camera(camera) => {
+                camera.project(p).filter(|_| p.z > 0.05).map(|pixel| (pixel.x, pixel.y, p.z))
+            }
             Eye::Above { pixels_per_m, left_m, far_m, top_m } => {
                 Some(((p.x - left_m) * pixels_per_m, (far_m - p.z) * pixels_per_m, p.y - top_m))
                     .filter(|(_, _, depth)| *depth > 0.0)

@@ -80,11 +80,19 @@ pub fn merge(parts: &[Part<'_>], settings: &MergeSettings) -> SurfelCloud {
 
 fn placed<'a>(parts: &'a [Part<'_>]) -> impl Iterator<Item = (usize, Surfel)> + 'a {
     let finite = |part: &'a Part<'_>| part.surfels.iter().filter(Surfel::is_finite);
-    parts.iter().enumerate().flat_map(move |(i, part)| finite(part).map(move |s| (i, s.moved(&part.map_from_submap))))
+    parts
+        .iter()
+        .enumerate()
+        .flat_map(move |(i, part)| finite(part).map(move |s| (i, s.moved(&part.map_from_submap))))
 }
 
 /// Which submap keeps its surfels in a cube; `None` if none shows it.
-fn keeper(shares: &HashMap<Cell, Vec<Share>>, cell: Cell, face_m2: f32, settings: &MergeSettings) -> Option<usize> {
+fn keeper(
+    shares: &HashMap<Cell, Vec<Share>>,
+    cell: Cell,
+    face_m2: f32,
+    settings: &MergeSettings,
+) -> Option<usize> {
     let (cube, side) = cell;
     let axis = side as usize / 2;
     let mut sums: Vec<Share> = Vec::new();
@@ -171,7 +179,9 @@ mod tests {
         let fine = wall(false);
         let mut coarse = wall(false);
         coarse.scale_m.fill([0.02, 0.02]);
-        for parts in [[at(&fine, 0.0, 0.005), at(&coarse, 0.0, 0.01)], [at(&coarse, 0.0, 0.01), at(&fine, 0.0, 0.005)]] {
+        for parts in
+            [[at(&fine, 0.0, 0.005), at(&coarse, 0.0, 0.01)], [at(&coarse, 0.0, 0.01), at(&fine, 0.0, 0.005)]]
+        {
             let merged = merge(&parts, &MergeSettings::default());
             assert_eq!(merged.len(), fine.len());
             assert!(merged.scale_m.iter().all(|s| s[0] == 0.01));

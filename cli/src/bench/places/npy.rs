@@ -3,7 +3,8 @@
 /// A `.npy` file, version 1.0: little-endian floats, `[rows, columns]`. All rows are equally long.
 pub fn of_rows(rows: &[Vec<f32>]) -> Vec<u8> {
     let columns = rows.first().map_or(0, Vec::len);
-    let fields = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, {columns}), }}", rows.len());
+    let fields =
+        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, {columns}), }}", rows.len());
     // Magic, version and length take 10 bytes; what follows the header begins at a multiple of 64.
     let length = (10 + fields.len() + 1).next_multiple_of(64) - 10;
     let mut out = b"\x93NUMPY\x01\x00".to_vec();
