@@ -7,6 +7,7 @@ mod demo;
 mod eval;
 mod export;
 mod fault;
+mod inspect_loops;
 mod play;
 mod progress;
 mod run;
@@ -41,12 +42,21 @@ enum Command {
     Gateway(serve::GatewayArguments),
     Stream(play::Arguments),
     Export(export::Arguments),
+    /// Shows what came of a run, and why.
+    #[command(subcommand)]
+    Inspect(Inspect),
     /// Writes synthetic data to disk.
     #[command(subcommand)]
     Synth(synth::Synth),
     /// Measures one part and prints its figures.
     #[command(subcommand)]
     Bench(bench::Bench),
+}
+
+/// What to show.
+#[derive(Subcommand)]
+enum Inspect {
+    Loops(inspect_loops::Arguments),
 }
 
 #[tokio::main]
@@ -63,6 +73,7 @@ async fn main() -> anyhow::Result<()> {
         Command::Gateway(arguments) => serve::gateway(arguments).await,
         Command::Stream(arguments) => play::run(arguments).await,
         Command::Export(arguments) => export::run(arguments).await,
+        Command::Inspect(Inspect::Loops(arguments)) => inspect_loops::run(&arguments),
         Command::Synth(synth) => synth::run(&synth),
         Command::Bench(bench) => bench::run(&bench),
     }
@@ -74,6 +85,7 @@ fn init_logging(command: &Command) -> anyhow::Result<()> {
         command,
         Command::Agent(_) | Command::PlaceRecognition(_) | Command::Dpgo(_) | Command::Gateway(_)
     );
-    let filter = std::env::var("RUST_LOG").unwrap_or_else(|_| if serves { "info".into() } else { "warn".into() });
+    let filter =
+        std::env::var("RUST_LOG").unwrap_or_else(|_| if serves { "info".into() } else { "warn".into() });
     Ok(coma_runtime::logging::init(&coma_runtime::LogSettings { filter, ..Default::default() })?)
 }

@@ -1,5 +1,11 @@
 //! Figures as tables: each bench measures one part.
 
+mod cpu;
+pub mod depth;
+pub mod index;
+mod overlap;
+pub mod places;
+pub mod registration;
 pub mod tracking;
 
 use clap::Subcommand;
@@ -9,11 +15,19 @@ use clap::Subcommand;
 pub enum Bench {
     /// One agent alone: accuracy and time per frame.
     Tracking(tracking::Arguments),
+    Registration(registration::Arguments),
+    Places(places::Arguments),
+    Index(index::Arguments),
+    Depth(depth::Arguments),
 }
 
 /// Runs it.
 pub fn run(bench: &Bench) -> anyhow::Result<()> {
     match bench {
         Bench::Tracking(arguments) => tracking::run(arguments),
+        Bench::Registration(arguments) => registration::run(arguments),
+        Bench::Places(arguments) => places::run(arguments),
+        Bench::Index(arguments) => index::run(arguments),
+        Bench::Depth(arguments) => depth::run(arguments),
     }
 }

@@ -19,7 +19,7 @@ const coma = {
   view,
   /** By submap: how often its surfels were downloaded. */
   downloads: {},
-  corrections: 0,
+  on,
   get counts() {
     const trajectories = {};
     for (const [agent, poses] of state.poses) trajectories[agent] = poses.length;
@@ -147,7 +147,6 @@ function on(event) {
       getSurfels();
       return redraw();
     case "correction":
-      coma.corrections++;
       state.correct(event.component);
       redraw();
       // Submaps after the cut are placed by their agent, and the graph has new weights.
@@ -180,6 +179,7 @@ const render = soon(async () => {
   const { clientWidth, clientHeight } = $("scene");
   const viewpoint = view.viewpoint(width, Math.max(8, Math.round((width * clientHeight) / clientWidth)));
   if (!viewpoint) return;
+  $("rendering").hidden = false;
   $("rendering-note").textContent = "rendering ...";
   const begin = performance.now();
   try {
@@ -187,10 +187,9 @@ const render = soon(async () => {
     const picture = await (await ask("api/v1/render", { method: "POST", body })).blob();
     if (pictureUrl) URL.revokeObjectURL(pictureUrl);
     pictureUrl = URL.createObjectURL(picture);
-    $("rendering").src = pictureUrl;
-    $("rendering").hidden = false;
+    $("picture").src = pictureUrl;
     const { width: w, height: h } = viewpoint.camera;
-    $("rendering-note").textContent = `${w} x ${h}, map ${viewpoint.map}, ${Math.round(performance.now() - begin)} ms`;
+    $("rendering-note").textContent = `${w} x ${h}, ${Math.round(performance.now() - begin)} ms`;
   } catch (error) {
     $("rendering-note").textContent = error.message;
     if (error instanceof TokenNeeded) failed(error);
@@ -218,6 +217,10 @@ $("save-map").addEventListener("click", () => saved("api/v1/map.ply", "map.ply")
 $("save-graph").addEventListener("click", () => saved("api/v1/graph", "graph.json"));
 $("render").addEventListener("click", render);
 $("output").addEventListener("change", render);
+$("close-rendering").addEventListener("click", () => {
+  $("rendering").hidden = true;
+  $("follow").checked = false;
+});
 view.onMoved(() => $("follow").checked && render());
 $("token").addEventListener("submit", (event) => {
   event.preventDefault();

@@ -2,12 +2,12 @@
 
 use crate::convert;
 use crate::node::{Node, Unfinished};
+use coma_runtime::Channel;
 use coma_slam::log::{Payload, SolveDigest, VersionVector};
 use coma_wire::v1::dpgo_client::DpgoClient;
 use coma_wire::{At, Wire, v1};
 use std::sync::Arc;
 use std::time::Duration;
-use coma_runtime::Channel;
 use tracing::{debug, info, warn};
 
 /// Changes that come together are solved together.
@@ -96,8 +96,10 @@ async fn solve(node: &Node, client: &mut DpgoClient<Channel>, given: &mut Given)
     }
     let joined = corrections.len();
     knowledge.corrections.replace(corrections);
-    for rejected in &response.rejected_entries {
-        warn!(key = ?rejected.key, message = %rejected.message, "an entry is not used in the graph");
+    let is_new = |rejected: &&v1::RejectedEntry| !knowledge.solved.rejected_entries.contains(rejected);
+    for rejected in response.rejected_entries.iter().filter(is_new) {
+        // Two agents may decide one pair: expected, and harmless.
+        debug!(key = ?rejected.key, message = %rejected.message, "an entry is not used in the graph");
     }
     knowledge.solved = response.clone();
     for digest in digests {
