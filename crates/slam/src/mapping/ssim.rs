@@ -57,7 +57,7 @@ pub fn ssim_and_gradient(a: &Image<[f32; 3]>, b: &Image<[f32; 3]>) -> (f64, Imag
             let source = |row: usize, plane: usize, out: &mut [f32]| {
                 out.copy_from_slice(&[by_mean, by_squares, by_product][plane][row * width..(row + 1) * width]);
             };
-            let mut blur = Blur::<3>::new(width, height, band * BAND, source);
+            let mut blur = Blur::<3, _>::new(width, height, band * BAND, source);
             for (i, out) in out.chunks_mut(width).enumerate() {
                 let at = (band * BAND + i) * width..(band * BAND + i + 1) * width;
                 let [by_mean, by_squares, by_product] = blur.next();
@@ -98,7 +98,7 @@ impl Slopes {
                     let (x, y) = (&x[row * width..(row + 1) * width], &y[row * width..(row + 1) * width]);
                     moment(plane, x, y, out);
                 };
-                let mut blur = Blur::<4>::new(width, height, band * BAND, source);
+                let mut blur = Blur::<4, _>::new(width, height, band * BAND, source);
                 for (i, sum) in row_sums.iter_mut().enumerate() {
                     let at = i * width..(i + 1) * width;
                     let by = [&mut by_mean[at.clone()], &mut by_squares[at.clone()], &mut by_product[at]];
