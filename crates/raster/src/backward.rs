@@ -6,7 +6,7 @@
 
 use crate::blend::TileSurfels;
 use crate::forward::RenderState;
-use crate::gradient::{SUMS, Sums, TileGradient, TileLoss};
+use crate::gradient::{Sums, TileGradient, TileLoss};
 use crate::parameters::to_parameters;
 use crate::{RenderSettings, Rendering, SubmapView};
 use coma_frame::Image;
@@ -61,46 +61,49 @@ pub fn backward(
     pixels: &PixelGradients,
 ) -> Gradients {
     let state = &rendering.state;
-    let per_tile: Vec<Vec<Sums>> = (0..state.grid.count())
-        .into_par_iter()
-        .map_init(
-            || (TileSurfels::default(), TileLoss::empty()),
-            |(surfels, loss), tile| {
-                let entries = &state.blended[tile];
+    let scratch = || (TileSurfels::default(), TileLoss::empty());
+    let sums: Vec<Vec<Sums>> = state
+        .blended
+        .par_iter()
+        .enumerate()
+        .map_init(scratch, |(surfels, loss), (row, blended)| {
+            let mut out = Vec::with_capacity(blended.entries.len());
+            for column in 0..state.grid.columns {
+                let entries = blended.tile(column);
                 if entries.is_empty() {
-                    return Vec::new();
+                    continue;
                 }
-                let origin = state.grid.origin(tile);
+                let origin = state.grid.origin(row * state.grid.columns + column);
                 surfels.gather_blended(entries, &state.order, &state.projected);
                 loss.read(rendering, pixels, origin);
-                let origin = origin.map(|v| v as f32);
-                state.arch.dispatch(TileGradient { surfels, origin, camera, settings, loss })
-            },
-        )
+                let (origin, out) = (origin.map(|v| v as f32), &mut out);
+                state.arch.dispatch(TileGradient { surfels, origin, camera, settings, loss, out });
+            }
+            out
+        })
         .collect();
-    let totals = totals(state, &per_tile);
-    to_parameters(submaps, camera, state, &totals)
+    to_parameters(submaps, camera, state, &totals(state, &sums))
 }
 
 /// Surfels that one task adds up, at least.
-const CHUNK: usize = 4096;
+const CHUNK: usize = 8192;
 
-/// Sums by rank. A task adds up a run of ranks, which is a run of every tile's entries, tile after tile.
-fn totals(state: &RenderState, per_tile: &[Vec<Sums>]) -> Vec<Sums> {
-    let mut totals = vec![[0.0f32; SUMS]; state.order.len()];
-    let chunk = CHUNK.max(totals.len() / 16);
+/// Sums by rank; `sums` are those of the rows of tiles. A task adds up a run of ranks, which is a run of every
+/// tile's entries, tile after tile.
+fn totals(state: &RenderState, sums: &[Vec<Sums>]) -> Vec<Sums> {
+    let mut totals: Vec<Sums> = bytemuck::zeroed_vec(state.order.len());
+    let chunk = CHUNK.max(totals.len().div_ceil(16));
     totals.par_chunks_mut(chunk).enumerate().for_each(|(i, totals)| {
         let first = (i * chunk) as u32;
         let end = first + totals.len() as u32;
-        for (entries, sums) in state.blended.iter().zip(per_tile) {
-            let from = entries.partition_point(|e| e.rank < first);
-            for (entry, sums) in entries[from..].iter().zip(&sums[from..]) {
-                if entry.rank >= end {
-                    break;
-                }
-                let total = &mut totals[(entry.rank - first) as usize];
-                for (t, s) in total.iter_mut().zip(sums) {
-                    *t += s;
+        for (blended, sums) in state.blended.iter().zip(sums) {
+            for column in 0..state.grid.columns {
+                let entries = blended.tile(column);
+                let sums = &sums[blended.starts[column] as usize..];
+                let from = entries.partition_point(|e| e.rank < first);
+                let run = entries[from..].iter().zip(&sums[from..]);
+                for (entry, sums) in run.take_while(|(entry, _)| entry.rank < end) {
+                    totals[(entry.rank - first) as usize].add(sums);
                 }
             }
         }

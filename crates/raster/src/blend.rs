@@ -1,12 +1,12 @@
 //! Front-to-back blending of one tile (eq. 3), block by block: a block's sums stay in registers while its
 //! surfels pass by, and a block whose pixels are done stops.
 
-use crate::hit::{Constants, Hits, Pixels};
+use crate::hit::{Constants, Hits, TilePixels};
 use crate::lanes::Lanes;
 use crate::project::Projected;
 use crate::settings::ObservedTile;
 use crate::tiles::Entry;
-use crate::{BLOCK, BLOCKS, LANES, RenderSettings, TILE};
+use crate::{BLOCKS, LANES, RenderSettings, TILE};
 use coma_geometry::Intrinsics;
 use pulp::{Simd, WithSimd};
 
@@ -59,26 +59,29 @@ impl TileSurfels {
     /// Takes a tile's entries; `slots` is by rank, `projected` by slot.
     pub fn gather(&mut self, entries: impl Iterator<Item = Entry>, slots: &[u32], projected: &[Projected]) {
         self.entries.clear();
-        self.projected.clear();
+        self.entries.extend(entries);
+        self.fetch(slots, projected);
         self.blocks.iter_mut().for_each(Vec::clear);
-        for entry in entries {
-            let index = self.entries.len() as u32;
-            let mut left = entry.blocks;
+        for (index, entry) in self.entries.iter_mut().enumerate() {
+            let mut left = std::mem::take(&mut entry.blocks);
             while left != 0 {
-                self.blocks[left.trailing_zeros() as usize % BLOCKS].push(index);
+                self.blocks[left.trailing_zeros() as usize % BLOCKS].push(index as u32);
                 left &= left - 1;
             }
-            self.entries.push(Entry { blocks: 0, ..entry });
-            self.projected.push(projected[slots[entry.rank as usize] as usize]);
         }
     }
 
     /// Takes what the blend left.
     pub fn gather_blended(&mut self, entries: &[Entry], slots: &[u32], projected: &[Projected]) {
         self.entries.clear();
-        self.projected.clear();
         self.entries.extend_from_slice(entries);
-        self.projected.extend(entries.iter().map(|entry| projected[slots[entry.rank as usize] as usize]));
+        self.fetch(slots, projected);
+    }
+
+    /// A loop of its own: its cache misses overlap, as they would not between the blend's computations.
+    fn fetch(&mut self, slots: &[u32], projected: &[Projected]) {
+        self.projected.clear();
+        self.projected.extend(self.entries.iter().map(|entry| projected[slots[entry.rank as usize] as usize]));
     }
 }
 
@@ -108,17 +111,16 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd for Bl
         let (zero, one, half) = (number(0.0), number(1.0), number(0.5));
         let TileSurfels { entries, projected, blocks } = self.surfels;
         let out = self.out;
+        let tile = TilePixels::of(simd, &constants, self.origin);
         let mut hits = 0.0f64;
         for (block, list) in blocks.iter().enumerate() {
-            let corner = [(block % BLOCK * BLOCK) as f32, (block / BLOCK * BLOCK) as f32];
-            let corner = [corner[0] + self.origin[0], corner[1] + self.origin[1]];
             for part in 0..LANES / S::F32_LANES {
-                let pixels = Pixels::of(simd, &constants, corner, part);
+                let at = block * (LANES / S::F32_LANES) + part;
+                let pixels = tile.load(simd, at);
                 let mut passing = pixels.inside(&constants).select(one, zero);
                 let (mut color, mut normal) = ([zero; 3], [zero; 3]);
                 let (mut depth, mut depth_squared, mut median) = (zero, zero, zero);
                 let (mut near, mut counted) = (zero, zero);
-                let at = block * (LANES / S::F32_LANES) + part;
                 let observed = Lanes::load(simd, &self.observed.depth, at);
                 let tolerance = Lanes::load(simd, &self.observed.tolerance, at);
                 for (step, index) in list.iter().enumerate() {

@@ -20,8 +20,22 @@ pub(crate) struct RenderState {
     pub projected: Vec<Projected>,
     /// Slots from near to far.
     pub order: Vec<u32>,
-    /// Of every tile what was blended there, from near to far.
-    pub blended: Vec<Vec<Entry>>,
+    /// What was blended, one for each row of tiles.
+    pub blended: Vec<BlendedRow>,
+}
+
+/// What was blended in a row of tiles.
+#[derive(Debug)]
+pub(crate) struct BlendedRow {
+    /// Entries of the tile in column `c` are `entries[starts[c]..starts[c + 1]]`, from near to far.
+    pub starts: Vec<u32>,
+    pub entries: Vec<Entry>,
+}
+
+impl BlendedRow {
+    pub fn tile(&self, column: usize) -> &[Entry] {
+        &self.entries[self.starts[column] as usize..self.starts[column + 1] as usize]
+    }
 }
 
 /// Renders submaps, sorted globally by the depth of their surfels' centres.
@@ -69,12 +83,13 @@ pub(crate) fn render_on(
     let mut bands = Bands::new(&mut out, camera);
     let bands: Vec<Band<'_>> = (0..grid.rows).map(|_| bands.next()).collect();
     let kernel = kernel(outputs, growth.is_some());
-    let blended: Vec<(Vec<Vec<Entry>>, u64)> = bands
+    let blended: Vec<(BlendedRow, u64)> = bands
         .into_par_iter()
         .enumerate()
         .map_init(Scratch::new, |scratch, (row, mut band)| {
             let mut hits = 0;
-            let blend = |column: usize| {
+            let mut blended = BlendedRow { starts: vec![0], entries: Vec::new() };
+            for column in 0..grid.columns {
                 let tile = row * grid.columns + column;
                 let origin = grid.origin(tile);
                 scratch.surfels.gather(tiles.entries(tile), &order, &scene.projected);
@@ -84,13 +99,14 @@ pub(crate) fn render_on(
                 kernel(arch, scratch, origin.map(|v| v as f32), camera, settings);
                 hits += scratch.images.hits;
                 band.write(&scratch.images, origin[0]);
-                scratch.surfels.entries.iter().filter(|e| e.blocks != 0).copied().collect()
-            };
-            ((0..grid.columns).map(blend).collect(), hits)
+                blended.entries.extend(scratch.surfels.entries.iter().filter(|e| e.blocks != 0));
+                blended.starts.push(blended.entries.len() as u32);
+            }
+            (blended, hits)
         })
         .collect();
     out.hits = blended.iter().map(|(_, hits)| hits).sum();
-    let blended = blended.into_iter().flat_map(|(row, _)| row).collect();
+    let blended = blended.into_iter().map(|(row, _)| row).collect();
     out.state = RenderState { arch, grid, projected: scene.projected, order, blended };
     out
 }

@@ -3,15 +3,80 @@
 
 use crate::backward::PixelGradients;
 use crate::blend::{TileImage, TileSurfels};
-use crate::hit::{Constants, Hits, Pixels};
+use crate::hit::{Constants, Hits, Pixels, TilePixels};
 use crate::lanes::Lanes;
+use crate::project::Projected;
 use crate::{ALPHA_MAX, BLOCK, LANES, RenderSettings, Rendering, TILE};
+use bytemuck::Zeroable;
 use coma_geometry::Intrinsics;
 use pulp::{Simd, WithSimd};
 
-/// Sums of one surfel: by a (3), b (3), n (3), k, pixel (2), centre depth, opacity, colour (3).
-pub(crate) const SUMS: usize = 17;
-pub(crate) type Sums = [f32; SUMS];
+/// What a surfel's hits are summed into: by a (3), b (3), n (3), k, pixel (2), centre depth, opacity, colour (3).
+const SUMS: usize = 17;
+
+/// Those sums in one line of the cache: the normal is of unit length, so what of its derivative lies along it
+/// is free; it is chosen so that the entry at the normal's largest axis is zero, which is not kept.
+#[derive(Clone, Copy, Debug, Zeroable)]
+#[repr(C, align(64))]
+pub(crate) struct Sums([f32; 16]);
+
+/// Sums, by name.
+pub(crate) struct Named {
+    pub a: [f32; 3],
+    pub b: [f32; 3],
+    pub n: [f32; 3],
+    pub k: f32,
+    pub pixel: [f32; 2],
+    pub z: f32,
+    pub opacity: f32,
+    pub color: [f32; 3],
+}
+
+impl Sums {
+    fn of(sums: &[f32; SUMS], p: &Projected) -> Self {
+        let axis = largest(&p.n);
+        let along = sums[6 + axis] / p.n[axis];
+        let (i, j) = ((axis + 1) % 3, (axis + 2) % 3);
+        let s = sums;
+        let by_n = [s[6 + i] - along * p.n[i], s[6 + j] - along * p.n[j]];
+        // By opacity: alpha is proportional to it.
+        let opacity = s[13] / p.opacity;
+        Sums([
+            s[0], s[1], s[2], s[3], s[4], s[5], by_n[0], by_n[1], s[9], s[10], s[11], s[12], opacity, s[14], s[15],
+            s[16],
+        ])
+    }
+
+    pub fn add(&mut self, other: &Sums) {
+        for (sum, value) in self.0.iter_mut().zip(&other.0) {
+            *sum += value;
+        }
+    }
+
+    /// `p` is the surfel that was summed.
+    pub fn named(&self, p: &Projected) -> Named {
+        let s = &self.0;
+        let axis = largest(&p.n);
+        let mut n = [0.0; 3];
+        (n[(axis + 1) % 3], n[(axis + 2) % 3]) = (s[6], s[7]);
+        Named {
+            a: [s[0], s[1], s[2]],
+            b: [s[3], s[4], s[5]],
+            n,
+            k: s[8],
+            pixel: [s[9], s[10]],
+            z: s[11],
+            opacity: s[12],
+            color: [s[13], s[14], s[15]],
+        }
+    }
+}
+
+/// The axis along which a vector is longest.
+fn largest(v: &[f32; 3]) -> usize {
+    let [x, y, z] = v.map(f32::abs);
+    if z >= x && z >= y { 2 } else { (y > x) as usize }
+}
 
 /// What the loss says of a tile's pixels, and the totals of the blend.
 pub(crate) struct TileLoss {
@@ -76,35 +141,35 @@ pub(crate) struct TileGradient<'a> {
     pub settings: &'a RenderSettings,
     /// Used up.
     pub loss: &'a mut TileLoss,
+    /// One is added for each surfel.
+    pub out: &'a mut Vec<Sums>,
 }
 
 impl WithSimd for TileGradient<'_> {
-    type Output = Vec<Sums>;
+    type Output = ();
 
     #[inline(always)]
-    fn with_simd<S: Simd>(self, simd: S) -> Vec<Sums> {
+    fn with_simd<S: Simd>(self, simd: S) {
         let constants = Constants::new(simd, self.camera, self.settings);
-        let mut out = Vec::with_capacity(self.surfels.entries.len());
+        let tile = TilePixels::of(simd, &constants, self.origin);
         for (entry, p) in self.surfels.entries.iter().zip(&self.surfels.projected) {
             let mut sums = [Lanes::splat(simd, 0.0); SUMS];
             let mut left = entry.blocks;
             while left != 0 {
                 let block = left.trailing_zeros() as usize % LANES;
                 left &= left - 1;
-                let corner = [(block % BLOCK * BLOCK) as f32, (block / BLOCK * BLOCK) as f32];
-                let corner = [corner[0] + self.origin[0], corner[1] + self.origin[1]];
                 for part in 0..LANES / S::F32_LANES {
                     let at = block * (LANES / S::F32_LANES) + part;
-                    let pixels = Pixels::of(simd, &constants, corner, part);
+                    let pixels = tile.load(simd, at);
                     add(simd, p, &pixels, &constants, self.loss, at, &mut sums);
                 }
             }
-            let mut sums = sums.map(Lanes::sum);
-            // By opacity: alpha is proportional to it.
-            sums[13] /= p.opacity;
-            out.push(sums);
+            let mut sum = [0.0; SUMS];
+            for k in 0..SUMS {
+                sum[k] = sums[k].sum();
+            }
+            self.out.push(Sums::of(&sum, p));
         }
-        out
     }
 }
 
@@ -112,7 +177,7 @@ impl WithSimd for TileGradient<'_> {
 #[inline(always)]
 fn add<S: Simd>(
     simd: S,
-    p: &crate::project::Projected,
+    p: &Projected,
     pixels: &Pixels<S>,
     constants: &Constants<S>,
     loss: &mut TileLoss,
@@ -126,7 +191,8 @@ fn add<S: Simd>(
     let live = constants.alpha_min.at_most(hit.alpha).and(constants.transmittance_min.less(passing));
     let alpha = live.select(hit.alpha, zero);
     let weight = alpha * passing;
-    let color: [Lanes<S>; 3] = std::array::from_fn(|c| Lanes::load(simd, &loss.color[c], at));
+    let [red, green, blue] = &loss.color;
+    let color = [Lanes::load(simd, red, at), Lanes::load(simd, green, at), Lanes::load(simd, blue, at)];
     let by_d = Lanes::load(simd, &loss.depth, at);
     // The loss's derivative by this hit's weight.
     let q = by_d.mul_add(hit.depth, Lanes::load(simd, &loss.opacity, at));
@@ -154,10 +220,11 @@ fn add<S: Simd>(
     let by_n = zero - by_u.mul_add(u, by_v.mul_add(v, by_k * hit.depth));
     let on_screen = by_screen * constants.low_pass;
     let (dx, dy) = (pixels.dx, pixels.dy);
-    for (i, by) in [by_u, by_v, by_n].into_iter().enumerate() {
-        sums[3 * i] = by.mul_add(dx, sums[3 * i]);
-        sums[3 * i + 1] = by.mul_add(dy, sums[3 * i + 1]);
-        sums[3 * i + 2] = sums[3 * i + 2] + by;
+    let by = [by_u, by_v, by_n];
+    for i in 0..3 {
+        sums[3 * i] = by[i].mul_add(dx, sums[3 * i]);
+        sums[3 * i + 1] = by[i].mul_add(dy, sums[3 * i + 1]);
+        sums[3 * i + 2] = sums[3 * i + 2] + by[i];
     }
     sums[9] = sums[9] + by_k;
     sums[10] = on_screen.mul_add(hit.ex, sums[10]);

@@ -3,7 +3,8 @@
 use crate::lanes::{Lanes, Mask};
 use crate::project::Projected;
 use crate::reach::per_block;
-use crate::{ALPHA_MAX, BLOCK, LANES, RenderSettings};
+use crate::blend::TileImage;
+use crate::{ALPHA_MAX, BLOCK, BLOCKS, LANES, RenderSettings, TILE};
 use coma_geometry::Intrinsics;
 use pulp::Simd;
 
@@ -18,6 +19,14 @@ pub(crate) struct Pixels<S: Simd> {
     pub y: Lanes<S>,
     pub dx: Lanes<S>,
     pub dy: Lanes<S>,
+}
+
+/// All pixels of a tile, block by block.
+pub(crate) struct TilePixels {
+    x: TileImage,
+    y: TileImage,
+    dx: TileImage,
+    dy: TileImage,
 }
 
 /// Camera and settings, one value in every lane.
@@ -55,16 +64,40 @@ impl<S: Simd> Constants<S> {
     }
 }
 
-impl<S: Simd> Pixels<S> {
-    /// The `part`-th vector of a block whose first pixel is `corner`.
+impl TilePixels {
+    /// Of the tile whose first pixel is `origin`.
     #[inline(always)]
-    pub fn of(simd: S, constants: &Constants<S>, corner: [f32; 2], part: usize) -> Self {
-        let x = Lanes::load(simd, &COLUMN, part) + Lanes::splat(simd, corner[0]);
-        let y = Lanes::load(simd, &ROW, part) + Lanes::splat(simd, corner[1]);
-        let (dx, dy) = ((x - constants.cx) * constants.inv_fx, (y - constants.cy) * constants.inv_fy);
-        Pixels { x, y, dx, dy }
+    pub fn of<S: Simd>(simd: S, constants: &Constants<S>, origin: [f32; 2]) -> Self {
+        let zero = [0.0; TILE * TILE];
+        let mut out = TilePixels { x: zero, y: zero, dx: zero, dy: zero };
+        for block in 0..BLOCKS {
+            let corner = [(block % BLOCK * BLOCK) as f32, (block / BLOCK * BLOCK) as f32];
+            for part in 0..LANES / S::F32_LANES {
+                let at = block * (LANES / S::F32_LANES) + part;
+                let x = Lanes::load(simd, &COLUMN, part) + Lanes::splat(simd, corner[0] + origin[0]);
+                let y = Lanes::load(simd, &ROW, part) + Lanes::splat(simd, corner[1] + origin[1]);
+                x.store(&mut out.x, at);
+                y.store(&mut out.y, at);
+                ((x - constants.cx) * constants.inv_fx).store(&mut out.dx, at);
+                ((y - constants.cy) * constants.inv_fy).store(&mut out.dy, at);
+            }
+        }
+        out
     }
 
+    /// The vector at `at`.
+    #[inline(always)]
+    pub fn load<S: Simd>(&self, simd: S, at: usize) -> Pixels<S> {
+        Pixels {
+            x: Lanes::load(simd, &self.x, at),
+            y: Lanes::load(simd, &self.y, at),
+            dx: Lanes::load(simd, &self.dx, at),
+            dy: Lanes::load(simd, &self.dy, at),
+        }
+    }
+}
+
+impl<S: Simd> Pixels<S> {
     /// Those within the image.
     #[inline(always)]
     pub fn inside(&self, constants: &Constants<S>) -> Mask<S> {

@@ -2,7 +2,7 @@
 
 use crate::backward::{Gradients, SurfelGradients};
 use crate::forward::RenderState;
-use crate::gradient::Sums;
+use crate::gradient::{Named, Sums};
 use crate::project::{CameraFromSubmap, InCamera, Projected};
 use crate::SubmapView;
 use coma_geometry::{Intrinsics, Tangent};
@@ -88,19 +88,19 @@ impl Submap<'_> {
             .enumerate()
             .map(|(chunk, (center, rotation, scale, opacity, color))| {
                 let mut pose = Tangent::zeros();
-                for i in 0..center.len() {
-                    let index = chunk * CHUNK + i;
-                    let rank = self.ranks[index];
-                    if rank == HIDDEN {
-                        continue;
-                    }
-                    let sums = &self.totals[rank as usize];
-                    let one = self.one(index, sums);
+                let ranks = &self.ranks[chunk * CHUNK..];
+                // Fetched in a loop of its own: its cache misses overlap.
+                let fetch = |rank: &u32| self.totals.get(*rank as usize).copied();
+                let totals: Vec<Option<Sums>> = ranks[..center.len()].iter().map(fetch).collect();
+                for (i, sums) in totals.iter().enumerate() {
+                    let Some(sums) = sums else { continue };
+                    let sums = sums.named(&self.projected[chunk * CHUNK + i]);
+                    let one = self.one(chunk * CHUNK + i, &sums);
                     center[i] = (self.submap_from_camera * one.center).into();
                     rotation[i] = one.rotation;
                     scale[i] = one.scale;
-                    opacity[i] = sums[13];
-                    color[i] = [sums[14], sums[15], sums[16]];
+                    opacity[i] = sums.opacity;
+                    color[i] = sums.color;
                     for axis in 0..3 {
                         // The pose moves everything by exp(-xi): d c = -(rho + phi x c), d e = -phi x e.
                         pose[axis] -= one.center[axis] as f64;
@@ -113,18 +113,17 @@ impl Submap<'_> {
         (out, poses.iter().sum())
     }
 
-    fn one(&self, index: usize, g: &Sums) -> OneSurfel {
+    fn one(&self, index: usize, g: &Named) -> OneSurfel {
         let p = &self.projected[index];
         let s = InCamera::of(self.view, &self.camera_from_submap, index);
         let (fx, fy) = (self.camera.fx as f32, self.camera.fy as f32);
         let (e1, e2, n): (Vector3<f32>, Vector3<f32>, Vector3<f32>) =
             (s.axes.column(0).into(), s.axes.column(1).into(), s.axes.column(2).into());
         let c = s.center;
-        let (ga, gb) = (Vector3::new(g[0], g[1], g[2]), Vector3::new(g[3], g[4], g[5]));
-        let mut by_n = Vector3::new(g[6], g[7], g[8]);
-        let mut by_k = g[9];
+        let mut by_n = Vector3::from(g.n);
+        let mut by_k = g.k;
         // a = (e1 k - n (e1 . c)) / s1, b likewise.
-        let (qa, qb) = (ga / s.scale[0], gb / s.scale[1]);
+        let (qa, qb) = (Vector3::from(g.a) / s.scale[0], Vector3::from(g.b) / s.scale[1]);
         let mut by_center = Vector3::zeros();
         let mut axis = |e: &Vector3<f32>, q: &Vector3<f32>| {
             let along = q.dot(&n);
@@ -140,9 +139,8 @@ impl Submap<'_> {
         by_n += c * by_k;
         by_center += n * by_k;
         // Centre pixel and depth.
-        by_center.x += g[10] * fx / c.z;
-        by_center.y += g[11] * fy / c.z;
-        by_center.z += g[12] - (g[10] * fx * c.x + g[11] * fy * c.y) / (c.z * c.z);
+        let (px, py) = (g.pixel[0] * fx / c.z, g.pixel[1] * fy / c.z);
+        by_center += Vector3::new(px, py, g.z - (px * c.x + py * c.y) / c.z);
         // Turning the disc about its own axes by w: d e1 = e2 w3 - n w2, d e2 = n w1 - e1 w3, d n = e1 w2 - e2 w1.
         let rotation = [
             by_e2.dot(&n) - by_n.dot(&e2),

@@ -2,7 +2,7 @@
 
 use crate::lanes::Lanes;
 use crate::project::InCamera;
-use crate::{BLOCK, RenderSettings};
+use crate::{BLOCK, RenderSettings, TILE};
 use bytemuck::Zeroable;
 use coma_geometry::Intrinsics;
 use pulp::Simd;
@@ -79,12 +79,17 @@ impl Reach {
         (x0 <= x1 && y0 <= y1).then_some(Reach { bounds, middle, conic, center: pixel, radius2 })
     }
 
+    /// First and last tile of the bounds: x0, y0, x1, y1.
+    pub fn tiles(&self) -> [usize; 4] {
+        self.bounds.map(|v| v as usize / TILE)
+    }
+
     /// Which of a tile's 16 blocks the region touches, one bit each. `origin` is the tile's first pixel.
     #[inline(always)]
     pub fn blocks<S: Simd>(&self, simd: S, origin: [f32; 2]) -> u16 {
         let number = |value: f32| Lanes::splat(simd, value);
         let (zero, last) = (number(0.0), number(BLOCK as f32 - 1.0));
-        let [xx, xy, yy] = self.conic.map(number);
+        let [xx, xy, yy] = [number(self.conic[0]), number(self.conic[1]), number(self.conic[2])];
         // Where the conic's slope is zero along a column and along a row.
         let (y_of_x, x_of_y) = match self.conic {
             [xx, xy, yy] if xx > 0.0 && yy > 0.0 => (number(-xy / yy), number(-xy / xx)),

@@ -82,9 +82,10 @@ impl WithSimd for Fill<'_> {
     fn with_simd<S: Simd>(self, simd: S) -> Run {
         let mut found: Vec<(u32, Entry)> = Vec::with_capacity(2 * self.slots.len());
         let mut starts = vec![0u32; self.grid.count() + 1];
-        for (i, slot) in self.slots.iter().enumerate() {
-            let reach = &self.reach[*slot as usize];
-            let [x0, y0, x1, y1] = reach.bounds.map(|v| v as usize / TILE);
+        // Fetched in a loop of its own: its cache misses overlap.
+        let reach: Vec<Reach> = self.slots.iter().map(|slot| self.reach[*slot as usize]).collect();
+        for (i, reach) in reach.iter().enumerate() {
+            let [x0, y0, x1, y1] = reach.tiles();
             for y in y0..=y1 {
                 for x in x0..=x1 {
                     let blocks = reach.blocks(simd, [(x * TILE) as f32, (y * TILE) as f32]);
