@@ -3,9 +3,9 @@
 mod page;
 
 use coma_geometry::{se3, tum};
+use coma_tests::story::{self, Cast, Walk};
 use coma_viewer_gateway::{GatewayConfig, Server};
 use serde_json::{Value, json};
-use coma_tests::story::{self, Cast, Walk};
 
 const NAMES: [&str; 2] = ["agent-00", "agent-01"];
 const WALKS: [Walk; 2] = [Walk { first_frame: 0, frames: 65 }, Walk { first_frame: 10, frames: 65 }];
