@@ -74,6 +74,7 @@ fn init_logging(command: &Command) -> anyhow::Result<()> {
         command,
         Command::Agent(_) | Command::PlaceRecognition(_) | Command::Dpgo(_) | Command::Gateway(_)
     );
-    let filter = std::env::var("RUST_LOG").unwrap_or_else(|_| if serves { "info".into() } else { "warn".into() });
+    let filter =
+        std::env::var("RUST_LOG").unwrap_or_else(|_| if serves { "info".into() } else { "warn".into() });
     Ok(coma_runtime::logging::init(&coma_runtime::LogSettings { filter, ..Default::default() })?)
 }

@@ -72,7 +72,15 @@ pub fn backward(
             let lanes = TileLoss::gather(rendering, pixels, x0, y0);
             let list = state.tiles.list(tile);
             let mut sums = vec![[0.0f32; SUMS]; list.len()];
-            tile_backward(&state.projected, list, [x0 as f32, y0 as f32], camera, settings, &lanes, &mut sums);
+            tile_backward(
+                &state.projected,
+                list,
+                [x0 as f32, y0 as f32],
+                camera,
+                settings,
+                &lanes,
+                &mut sums,
+            );
             sums
         })
         .collect();
@@ -104,7 +112,9 @@ impl TileLoss {
         let mut out = TileLoss { color: [zero; 3], depth: zero, opacity: zero, total: zero, inside: zero };
         for lane in 0..LANES {
             let (x, y) = (x0 + lane % TILE, y0 + lane / TILE);
-            let (Some(by_color), true) = (pixels.color.get(x, y), y < rendering.color.height()) else { continue };
+            let (Some(by_color), true) = (pixels.color.get(x, y), y < rendering.color.height()) else {
+                continue;
+            };
             let a = rendering.opacity[(x, y)];
             let depth = rendering.depth_m[(x, y)];
             // E = D / A: by D it is g / A, by A it is -g E / A.
@@ -276,11 +286,8 @@ fn to_parameters(
         by_center.y += g[11] * fy / c.z;
         by_center.z += g[12] - (g[10] * fx * c.x + g[11] * fy * c.y) / (c.z * c.z);
         // Turning the disc about its own axes by w: d e1 = e2 w3 - n w2, d e2 = n w1 - e1 w3, d n = e1 w2 - e2 w1.
-        let by_rotation = [
-            by_e2.dot(&n) - by_n.dot(&e2),
-            by_n.dot(&e1) - by_e1.dot(&n),
-            by_e1.dot(&e2) - by_e2.dot(&e1),
-        ];
+        let by_rotation =
+            [by_e2.dot(&n) - by_n.dot(&e2), by_n.dot(&e1) - by_e1.dot(&n), by_e1.dot(&e2) - by_e2.dot(&e1)];
         // The pose moves everything by exp(-xi): d c = -(rho + phi x c), d e = -phi x e.
         let turn = c.cross(&by_center) + e1.cross(&by_e1) + e2.cross(&by_e2) + n.cross(&by_n);
         for axis in 0..3 {

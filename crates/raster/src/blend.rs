@@ -36,7 +36,13 @@ pub(crate) fn rows(p: &Projected, y0: f32) -> std::ops::Range<usize> {
 
 /// Alpha (0 below the least) and depth of a surfel along one row of a tile.
 #[inline(always)]
-pub(crate) fn row_hits(p: &Projected, x0: f32, y: f32, camera: &CameraF32, settings: &RenderSettings) -> RowHits {
+pub(crate) fn row_hits(
+    p: &Projected,
+    x0: f32,
+    y: f32,
+    camera: &CameraF32,
+    settings: &RenderSettings,
+) -> RowHits {
     let mut out = RowHits { alpha: [0.0; TILE], depth: [0.0; TILE] };
     let dy = (y - camera.cy) * camera.inv_fy;
     let base = |v: &[f32; 3]| v[1] * dy + v[2];
@@ -74,7 +80,12 @@ pub(crate) struct CameraF32 {
 
 impl From<&Intrinsics> for CameraF32 {
     fn from(c: &Intrinsics) -> Self {
-        CameraF32 { inv_fx: (1.0 / c.fx) as f32, inv_fy: (1.0 / c.fy) as f32, cx: c.cx as f32, cy: c.cy as f32 }
+        CameraF32 {
+            inv_fx: (1.0 / c.fx) as f32,
+            inv_fy: (1.0 / c.fy) as f32,
+            cx: c.cx as f32,
+            cy: c.cy as f32,
+        }
     }
 }
 

@@ -87,7 +87,14 @@ pub fn render(
         .map(|tile| {
             let (x0, y0) = tiles.origin(tile);
             let observed = growth.map(|test| test.tile(x0, y0));
-            blend::blend_tile(&projected, tiles.list(tile), [x0 as f32, y0 as f32], camera, settings, observed.as_ref())
+            blend::blend_tile(
+                &projected,
+                tiles.list(tile),
+                [x0 as f32, y0 as f32],
+                camera,
+                settings,
+                observed.as_ref(),
+            )
         })
         .collect();
 

@@ -92,7 +92,19 @@ fn project_one(
     let (fx, fy) = (camera.fx as f32, camera.fy as f32);
     let pixel = [fx * s.center.x / z + camera.cx as f32, fy * s.center.y / z + camera.cy as f32];
     let bounds = bounds(&s, pixel, opacity, camera, settings)?;
-    Some(Projected { a: a.into(), b: b.into(), n: n.into(), k, pixel, z, opacity, color, bounds, submap, index })
+    Some(Projected {
+        a: a.into(),
+        b: b.into(),
+        n: n.into(),
+        k,
+        pixel,
+        z,
+        opacity,
+        color,
+        bounds,
+        submap,
+        index,
+    })
 }
 
 /// The pixels at which alpha can reach its least value: the box of the disc's conic, and that of the low-pass

@@ -55,7 +55,8 @@ impl GrowthTest<'_> {
             let depth = self.observed_depth_m.get(x0 + lane % TILE, y0 + lane / TILE).copied().unwrap_or(0.0);
             if depth > 0.0 {
                 out.depth[lane] = depth;
-                out.tolerance[lane] = (self.sigma_factor * self.noise.sigma_m(depth)).max(self.relative * depth);
+                out.tolerance[lane] =
+                    (self.sigma_factor * self.noise.sigma_m(depth)).max(self.relative * depth);
             }
         }
         out

@@ -173,7 +173,8 @@ impl Sequence for WorldSequence {
             return Err(DatasetError::NoSuchFrame { index, len: self.len() });
         }
         let (scene, light) = &*self.world.stage;
-        let picture = render::render(scene, light, &self.calibration.color, &self.tour.world_from_camera(index));
+        let picture =
+            render::render(scene, light, &self.calibration.color, &self.tour.world_from_camera(index));
         let seed = noise::hash(self.world.settings.seed as u32, 1000 + self.agent as u32);
         let (color, depth) = sensor::expose(
             &picture,

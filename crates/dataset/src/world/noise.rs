@@ -47,7 +47,8 @@ pub fn octaves(x_m: f32, y_m: f32, wavelength_m: f32, count: u32, footprint_m: f
         if visible <= 0.0 {
             break;
         }
-        sum += visible * amplitude * value(x_m / wavelength, y_m / wavelength, seed.wrapping_add(octave * 7919));
+        sum +=
+            visible * amplitude * value(x_m / wavelength, y_m / wavelength, seed.wrapping_add(octave * 7919));
         amplitude *= 0.72;
         wavelength *= 0.45;
     }

@@ -80,7 +80,9 @@ pub fn loss(rendering: &Rendering, target: &Target, settings: &OptimiseSettings)
     let l1_step = (1.0 - settings.ssim_weight) / (3.0 * pixels);
     let mut l1 = 0.0f64;
     let mut color = ssim_gradient;
-    for (g, (c, t)) in color.pixels_mut().iter_mut().zip(rendering.color.pixels().iter().zip(target.color.pixels())) {
+    for (g, (c, t)) in
+        color.pixels_mut().iter_mut().zip(rendering.color.pixels().iter().zip(target.color.pixels()))
+    {
         for k in 0..3 {
             let r = c[k] - t[k];
             l1 += r.abs() as f64;
@@ -149,7 +151,12 @@ impl Adam {
     }
 
     /// One step. Surfels without any gradient (not seen) stay as they are.
-    pub fn step(&mut self, surfels: &mut SurfelCloud, gradients: &SurfelGradients, settings: &OptimiseSettings) {
+    pub fn step(
+        &mut self,
+        surfels: &mut SurfelCloud,
+        gradients: &SurfelGradients,
+        settings: &OptimiseSettings,
+    ) {
         const BETA1: f32 = 0.9;
         const BETA2: f32 = 0.99;
         self.resize(surfels.len());
@@ -168,7 +175,18 @@ impl Adam {
             // By the chain rule: d/d log s = s d/ds, d/d logit o = o (1 - o) d/do.
             let by_logit = gradients.opacity[i] * opacity * (1.0 - opacity);
             let g = [
-                c[0], c[1], c[2], r[0], r[1], r[2], s[0] * scale[0], s[1] * scale[1], by_logit, k[0], k[1], k[2],
+                c[0],
+                c[1],
+                c[2],
+                r[0],
+                r[1],
+                r[2],
+                s[0] * scale[0],
+                s[1] * scale[1],
+                by_logit,
+                k[0],
+                k[1],
+                k[2],
             ];
             if g.iter().all(|v| *v == 0.0) || !g.iter().all(|v| v.is_finite()) {
                 continue;

@@ -72,7 +72,8 @@ pub fn ssim_and_gradient(a: &Image<[f32; 3]>, b: &Image<[f32; 3]>) -> (f64, Imag
             // By the mean, variance and covariance of the window; these depend on mu_x too.
             let by_variance = -s / b2;
             let by_covariance = 2.0 * a1 * inverse;
-            by_mu[i] = 2.0 * my * a2 * inverse - 2.0 * mx * s / b1 - 2.0 * mx * by_variance - my * by_covariance;
+            by_mu[i] =
+                2.0 * my * a2 * inverse - 2.0 * mx * s / b1 - 2.0 * mx * by_variance - my * by_covariance;
             by_xx[i] = by_variance;
             by_xy[i] = by_covariance;
         }
