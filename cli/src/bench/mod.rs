@@ -1,5 +1,8 @@
 //! Figures as tables: each bench measures one part.
 
+mod clock;
+pub mod graph;
+pub mod robust;
 pub mod tracking;
 
 use clap::Subcommand;
@@ -9,11 +12,15 @@ use clap::Subcommand;
 pub enum Bench {
     /// One agent alone: accuracy and time per frame.
     Tracking(tracking::Arguments),
+    Graph(graph::Arguments),
+    Robust(robust::Arguments),
 }
 
 /// Runs it.
 pub fn run(bench: &Bench) -> anyhow::Result<()> {
     match bench {
         Bench::Tracking(arguments) => tracking::run(arguments),
+        Bench::Graph(arguments) => graph::run(arguments),
+        Bench::Robust(arguments) => robust::run(arguments),
     }
 }
