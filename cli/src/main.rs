@@ -7,6 +7,7 @@ mod demo;
 mod eval;
 mod export;
 mod fault;
+mod inspect;
 mod play;
 mod progress;
 mod run;
@@ -44,6 +45,9 @@ enum Command {
     /// Writes synthetic data to disk.
     #[command(subcommand)]
     Synth(synth::Synth),
+    /// Says what a file holds.
+    #[command(subcommand)]
+    Inspect(inspect::Inspect),
     /// Measures one part and prints its figures.
     #[command(subcommand)]
     Bench(bench::Bench),
@@ -64,6 +68,7 @@ async fn main() -> anyhow::Result<()> {
         Command::Stream(arguments) => play::run(arguments).await,
         Command::Export(arguments) => export::run(arguments).await,
         Command::Synth(synth) => synth::run(&synth),
+        Command::Inspect(inspect) => inspect::run(&inspect),
         Command::Bench(bench) => bench::run(&bench),
     }
 }

@@ -1,10 +1,10 @@
 //! `coma bench graph`: pose graphs of g2o files, solved from a chordal start: costs, times and the certificate.
 
+use super::blocks;
 use super::clock::{Spent, timed};
-use anyhow::Context;
+use super::sets;
 use clap::Args;
 use coma_pose_graph::certificate::{Certificate, certify};
-use coma_pose_graph::g2o::G2oGraph;
 use coma_pose_graph::initialise::chordal;
 use coma_pose_graph::isotropic::objective;
 use coma_pose_graph::{Objective, Problem, Solver, SolverSettings};
@@ -18,12 +18,17 @@ use std::path::{Path, PathBuf};
 /// objective, at the minimum of the cost and at its own. Times are of the processor.
 #[derive(Args)]
 pub struct Arguments {
-    /// g2o files of one robot each.
+    /// g2o files, or folders with one for each robot.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Repetitions; the fastest counts.
     #[arg(long, default_value_t = 3)]
     reps: usize,
+    /// Solves block by block instead, cut into so many blocks of consecutive vertices: several numbers, by commas.
+    #[arg(long, value_delimiter = ',')]
+    blocks: Vec<usize>,
+    #[command(flatten)]
+    network: blocks::NetworkArguments,
     /// Prints JSON instead of a table.
     #[arg(long)]
     json: bool,
@@ -52,6 +57,9 @@ struct Row {
 
 /// Runs it.
 pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    if !arguments.blocks.is_empty() {
+        return blocks::run(&arguments.files, &arguments.blocks, &arguments.network, arguments.json);
+    }
     let rows: Vec<Row> =
         arguments.files.iter().map(|file| row(file, arguments.reps)).collect::<anyhow::Result<_>>()?;
     if arguments.json {
@@ -60,13 +68,6 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         print!("{}", table(&rows));
     }
     Ok(())
-}
-
-/// Name of a set and its graph.
-pub fn read(file: &Path) -> anyhow::Result<(String, G2oGraph)> {
-    let name = file.file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
-    let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
-    Ok((name, G2oGraph::parse(&text).with_context(|| file.display().to_string())?))
 }
 
 /// The fastest of several runs.
@@ -85,7 +86,7 @@ fn fastest<T>(reps: usize, mut work: impl FnMut() -> anyhow::Result<T>) -> anyho
 }
 
 fn row(file: &Path, reps: usize) -> anyhow::Result<Row> {
-    let (read, reading) = timed(|| self::read(file));
+    let (read, reading) = timed(|| sets::whole(file));
     let (set, graph) = read?;
     let (problem, given) = graph.problem();
     let weights = vec![1.0; problem.constraints.len()];

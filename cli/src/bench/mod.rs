@@ -1,8 +1,10 @@
 //! Figures as tables: each bench measures one part.
 
+mod blocks;
 mod clock;
 pub mod graph;
 pub mod robust;
+pub mod sets;
 pub mod tracking;
 
 use clap::Subcommand;

@@ -1,10 +1,10 @@
 //! `coma bench robust`: false loops against the public sets: do they lose, and do the true ones win?
 
 use super::clock::{Spent, timed};
-use anyhow::{Context, bail, ensure};
+use super::sets;
+use anyhow::{bail, ensure};
 use clap::Args;
 use coma_geometry::{Epoch, Matrix6, Pose, SubmapId, se3};
-use coma_pose_graph::g2o::{G2oGraph, G2oLimits};
 use coma_pose_graph::residual::{residual, squared_mahalanobis};
 use coma_pose_graph::team::{self, Believed};
 use coma_pose_graph::{Component, Edge, EdgeKey, EdgeKind, GlobalSettings, GraphEntries, solve};
@@ -98,22 +98,9 @@ struct Clean {
 
 impl Clean {
     fn new(path: &Path, information: Option<Matrix6>, settings: &GlobalSettings) -> anyhow::Result<Self> {
-        let set = path.file_stem().map_or_else(String::new, |stem| stem.to_string_lossy().into_owned());
-        let mut files = vec![path.to_owned()];
-        let mut believed = Believed::Consecutive;
-        if path.is_dir() {
-            let listed = std::fs::read_dir(path).with_context(|| path.display().to_string())?;
-            files = listed.map(|file| Ok(file?.path())).collect::<anyhow::Result<_>>()?;
-            files.sort();
-            // What a robot measured of itself; who doubts that has no map to begin with.
-            believed = Believed::WithinARobot;
-        }
-        let mut graphs = Vec::new();
-        for file in &files {
-            let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
-            let graph = G2oGraph::parse_part(&text, &G2oLimits::default());
-            graphs.push(graph.with_context(|| file.display().to_string())?);
-        }
+        let (set, graphs) = sets::read(path)?;
+        // What a robot measured of itself; who doubts that has no map to begin with.
+        let believed = if path.is_dir() { Believed::WithinARobot } else { Believed::Consecutive };
         let (entries, _) = team::entries(&graphs, believed, information)?;
         let mut solution = solve(&entries, settings);
         ensure!(solution.components.len() == 1, "{set}: the graph is not one component without false loops");

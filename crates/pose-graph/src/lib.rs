@@ -9,6 +9,7 @@
 //! * [`gnc`], [`clique`], [`consistency`]: which loops to believe.
 //! * [`chain`], [`relative`]: which trajectories may join, and where they stand to each other (eq. 12).
 //! * [`global`]: the canonical solve of everything that is known (eq. 10); [`solution`] is its result.
+//! * [`preview`]: what a new measurement does to the last result, at once and provisionally.
 //! * [`blocks`]: the same without anyone who holds the whole graph.
 //! * [`covariance`]: how sure a pose is. [`g2o`], [`team`]: files.
 //!
@@ -34,6 +35,7 @@ pub mod graph;
 pub mod initialise;
 pub mod isotropic;
 mod lanczos;
+pub mod preview;
 pub mod relative;
 pub mod residual;
 pub mod solution;

@@ -47,13 +47,8 @@ pub fn information_of(sigma_m: f64, sigma_rad: f64) -> Matrix6 {
     Matrix6::from_diagonal(&Tangent::from_fn(|k, _| if k < 3 { sigma_m } else { sigma_rad }.powi(-2)))
 }
 
-/// The entries of graphs that are one together, and the vertex of each submap. `information` replaces that of the files.
-/// An edge that is in several files counts once. Each edge is written by its first robot, in the order of its ends.
-pub fn entries(
-    graphs: &[G2oGraph],
-    believed: Believed,
-    information: Option<Matrix6>,
-) -> Result<(GraphEntries, BTreeMap<SubmapId, u64>), TeamError> {
+/// Graphs that are one together; an edge that is in several files counts once. Edges are in the order of their ends.
+pub fn merged(graphs: &[G2oGraph]) -> Result<G2oGraph, TeamError> {
     let mut whole = G2oGraph::default();
     let mut edges: BTreeMap<(u64, u64), &G2oEdge> = BTreeMap::new();
     for graph in graphs {
@@ -62,12 +57,24 @@ pub fn entries(
                 return Err(TeamError::Duplicate { id: *id });
             }
         }
+        whole.fixed.extend(&graph.fixed);
         for edge in &graph.edges {
             edges.insert((edge.from, edge.to), edge);
         }
     }
     whole.edges = edges.values().map(|e| (*e).clone()).collect();
     whole.check()?;
+    Ok(whole)
+}
+
+/// The entries of graphs that are one together, and the vertex of each submap. `information` replaces that of the files.
+/// Each edge is written by the robot that it starts from.
+pub fn entries(
+    graphs: &[G2oGraph],
+    believed: Believed,
+    information: Option<Matrix6>,
+) -> Result<(GraphEntries, BTreeMap<SubmapId, u64>), TeamError> {
+    let whole = merged(graphs)?;
     let mut submaps: BTreeMap<u64, SubmapId> = BTreeMap::new();
     let mut entries = GraphEntries::default();
     let mut next: BTreeMap<AgentId, u32> = BTreeMap::new();

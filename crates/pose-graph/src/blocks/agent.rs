@@ -16,8 +16,8 @@ use std::collections::BTreeMap;
 pub struct BlockSettings {
     /// Linear solves in one step.
     pub iterations_per_step: u32,
-    /// Largest factor by which a step goes beyond the block's own minimum. 1 for none; below 2.
-    pub most_relaxation: f64,
+    /// Largest share of the last move that a step carries on with. 0 for plain descent; below 1.
+    pub most_momentum: f64,
     /// A node that has moved by less than this since it was last told of, in metres,
     pub still_m: f64,
     /// and by less than this, in radians, is not told of again.
@@ -32,7 +32,7 @@ impl Default for BlockSettings {
     fn default() -> Self {
         BlockSettings {
             iterations_per_step: 3,
-            most_relaxation: 1.8,
+            most_momentum: 0.7,
             still_m: 1e-5,
             still_rad: 1e-6,
             squared_error_6dof: 22.458,
@@ -70,10 +70,18 @@ pub struct BlockAgent {
     sequence: u64,
     /// Own poses under that sequence.
     said: BTreeMap<NodeId, Pose>,
-    relaxation: f64,
-    /// The block's own minimum at the last step, and how it had moved.
-    target: BTreeMap<NodeId, Pose>,
-    trend: BTreeMap<NodeId, Tangent>,
+    /// Share of the last move that the next step carries on with.
+    momentum: f64,
+    /// How the nodes moved in the last step.
+    moved: BTreeMap<NodeId, Tangent>,
+    /// Running mean of the distance to the block's own minimum, all nodes together.
+    usual_step: f64,
+    /// The least that it was since momentum was last cut.
+    least_step: f64,
+    most_momentum: f64,
+    /// How far the farthest were from it in the last step.
+    farthest_m: f64,
+    farthest_rad: f64,
     /// The problem over what is placed and known at present.
     local: Option<Local>,
     /// Something was heard, or a descent is not finished.
@@ -107,9 +115,13 @@ impl BlockAgent {
             neighbours,
             sequence: 0,
             said: BTreeMap::new(),
-            relaxation: 1.0,
-            target: BTreeMap::new(),
-            trend: BTreeMap::new(),
+            momentum: 0.0,
+            moved: BTreeMap::new(),
+            usual_step: 0.0,
+            least_step: f64::INFINITY,
+            most_momentum: settings.most_momentum,
+            farthest_m: 0.0,
+            farthest_rad: 0.0,
             local: None,
             busy: true,
             iterations: 0,
@@ -228,16 +240,18 @@ impl BlockAgent {
                 let placed = self.poses.len();
                 local.place(&mut self.poses, &self.known, &self.weights)?;
                 if self.poses.len() > placed {
-                    self.relaxation = 1.0;
-                    self.target.clear();
-                    self.trend.clear();
+                    self.momentum = 0.0;
+                    self.moved.clear();
+                    self.usual_step = 0.0;
+                    self.least_step = f64::INFINITY;
                 }
             }
         }
         Ok(())
     }
 
-    /// Moves the block's nodes to, or beyond, the minimum that they have while all others stay.
+    /// Moves the block's nodes to the minimum that they have while all others stay, and on in the direction of the last
+    /// move (heavy ball). Where the minimum lies against that direction the momentum is lost.
     fn descend(&mut self) -> Result<(), SolveError> {
         let Some(local) = &mut self.local else { return Ok(()) };
         let settings = SolverSettings {
@@ -249,41 +263,39 @@ impl BlockAgent {
         self.iterations += u64::from(solved.iterations);
         // What is not at its minimum yet goes on without news.
         self.busy |= !solved.converged;
-        self.relax(&target);
-        for (node, goal) in &target {
-            let Some(pose) = self.poses.get_mut(node) else { continue };
-            *pose *= se3::exp(&(se3::log(&pose.inv_mul(goal)) * self.relaxation));
-            pose.rotation.renormalize();
-        }
-        self.target = target;
-        Ok(())
-    }
-
-    /// Where the minimum keeps moving one way, steps go further; where it swings, less far.
-    fn relax(&mut self, target: &BTreeMap<NodeId, Pose>) {
-        let moved = |(node, goal): (&NodeId, &Pose)| {
-            Some((*node, se3::log(&self.target.get(node)?.inv_mul(goal))))
+        let to_minimum = |(node, goal): (&NodeId, &Pose)| {
+            Some((*node, se3::log(&self.poses.get(node)?.inv_mul(goal))))
         };
-        let trend: BTreeMap<NodeId, Tangent> = target.iter().filter_map(moved).collect();
-        let scale = self.local.as_ref().map_or(1.0, Local::rotation_scale_m);
+        let steps: BTreeMap<NodeId, Tangent> = target.iter().filter_map(to_minimum).collect();
+        let scale_m = local.rotation_scale_m();
         let dot = |a: &Tangent, b: &Tangent| {
-            a.fixed_rows::<3>(0).dot(&b.fixed_rows::<3>(0))
-                + scale * scale * a.fixed_rows::<3>(3).dot(&b.fixed_rows::<3>(3))
+            let turn = a.fixed_rows::<3>(3).dot(&b.fixed_rows::<3>(3));
+            a.fixed_rows::<3>(0).dot(&b.fixed_rows::<3>(0)) + scale_m * scale_m * turn
         };
-        let (mut along, mut now, mut before) = (0.0, 0.0, 0.0);
-        for (node, step) in &trend {
-            let Some(last) = self.trend.get(node) else { continue };
-            along += dot(step, last);
-            now += dot(step, step);
-            before += dot(last, last);
+        let length = steps.values().map(|step| dot(step, step)).sum::<f64>().sqrt();
+        self.usual_step = if self.usual_step > 0.0 { 0.8 * self.usual_step + 0.2 * length } else { length };
+        self.least_step = self.least_step.min(self.usual_step);
+        // Swinging around the minimum is what momentum does; swinging farther and farther is too much of it, as stale
+        // news makes it. In the end this is plain descent.
+        if self.usual_step > 3.0 * self.least_step {
+            self.most_momentum *= 0.7;
+            self.momentum = 0.0;
+            self.moved.clear();
+            self.least_step = self.usual_step;
         }
-        let cosine = along / (now * before).sqrt();
-        if cosine > 0.3 {
-            self.relaxation = (self.relaxation + 0.1).min(self.settings.most_relaxation);
-        } else if cosine < -0.2 {
-            self.relaxation = (self.relaxation * 0.8).max(0.5);
+        self.momentum = (self.momentum + 0.1).min(self.most_momentum);
+        (self.farthest_m, self.farthest_rad) = (0.0, 0.0);
+        for (node, step) in steps {
+            let Some(pose) = self.poses.get_mut(&node) else { continue };
+            self.farthest_m = self.farthest_m.max(step.fixed_rows::<3>(0).norm());
+            self.farthest_rad = self.farthest_rad.max(step.fixed_rows::<3>(3).norm());
+            let carried = self.moved.get(&node).map_or_else(Tangent::zeros, |moved| moved * self.momentum);
+            let step = step + carried;
+            *pose *= se3::exp(&step);
+            pose.rotation.renormalize();
+            self.moved.insert(node, step);
         }
-        self.trend = trend;
+        Ok(())
     }
 
     fn has_moved(&self) -> bool {
@@ -298,11 +310,9 @@ impl BlockAgent {
 
     /// Once the block is nearly still, doubted measurements count if they fit. True if a weight has changed.
     fn reweigh(&mut self) -> bool {
-        let settled = |(node, pose): (&NodeId, &Pose)| {
-            let (m, rad) = self.target.get(node).map_or((0.0, 0.0), |target| se3::distance(pose, target));
-            m < 1e3 * self.settings.still_m && rad < 1e3 * self.settings.still_rad
-        };
-        let Some(local) = self.local.as_ref().filter(|_| self.poses.iter().all(settled)) else { return false };
+        let settled = self.farthest_m < 1e3 * self.settings.still_m
+            && self.farthest_rad < 1e3 * self.settings.still_rad;
+        let Some(local) = self.local.as_ref().filter(|_| settled) else { return false };
         let mut next = self.weights.clone();
         for (k, edge) in self.block.edges.iter().enumerate() {
             let c = &edge.constraint;
