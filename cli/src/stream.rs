@@ -131,7 +131,7 @@ async fn open(
 ) -> anyhow::Result<u64> {
     let request = v1::OpenSessionRequest {
         session_id: options.session_id.clone(),
-        calibration: Some(calibration.clone()),
+        calibration: Some(*calibration),
         policy: options.policy.into(),
         clock_domain: v1::ClockDomain::Device.into(),
         hold_out_every: options.hold_out_every,
@@ -162,6 +162,10 @@ async fn play(
             };
             if let Some(fps) = rate_fps {
                 let due = Duration::from_secs_f64((index - from) as f64 / fps.max(1e-3));
+                #[allow(
+                    clippy::disallowed_methods,
+                    reason = "a thread that may block plays at the camera's pace"
+                )]
                 std::thread::sleep(due.saturating_sub(begin.elapsed()));
             }
             let message = v1::StreamFramesRequest { session_id: session_id.clone(), frame: Some(frame) };

@@ -128,7 +128,7 @@ fn what_is_wrong_is_said_with_the_name_of_the_file_or_argument() {
 fn a_synthetic_sequence_can_be_written_and_read_back() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("flat");
-    let size = ["--frames", "3", "--width", "80", "--height", "60", "--agents", "2"];
+    let size = ["--frames", "3", "--width", "160", "--height", "120", "--agents", "2"];
     let specs = succeeds(&[&["synth", "rooms", "--out", out.to_str().unwrap()][..], &size[..]].concat());
     let specs: Vec<&str> = specs.lines().collect();
     assert_eq!(specs.len(), 2, "{specs:?}");

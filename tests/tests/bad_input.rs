@@ -150,7 +150,7 @@ async fn a_peer_that_cannot_be_reached_is_told_by_name_and_disturbs_nothing() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         format!("http://{}", listener.local_addr().unwrap())
     };
-    let cast = Cast::start_with_peers(&["agent-00"], &[nobody.clone()]).await;
+    let cast = Cast::start_with_peers(&["agent-00"], std::slice::from_ref(&nobody)).await;
     cast.stream(&[Walk { first_frame: 0, frames: 3 }]).await;
     let told = async {
         loop {

@@ -2,7 +2,7 @@
 
 use anyhow::Context;
 use coma_dataset::Sequence;
-use coma_frame::Image;
+use coma_frame::{Image, RgbdFrame};
 use coma_geometry::nalgebra::Point3;
 use coma_geometry::{Intrinsics, Pose};
 
@@ -20,11 +20,11 @@ pub struct Sight {
 }
 
 impl Sight {
-    /// Frame `index` of a sequence whose true poses are known.
-    pub fn of(sequence: &dyn Sequence, index: usize) -> anyhow::Result<Sight> {
+    /// Frame `index` of a sequence whose true poses are known, and what it saw.
+    pub fn of(sequence: &dyn Sequence, index: usize) -> anyhow::Result<(Sight, RgbdFrame)> {
         let truth = sequence.truth(index).with_context(|| format!("frame {index} has no true pose"))?;
         let frame = coma_dataset::sequence::rgbd_frame(sequence, index)?;
-        Ok(Sight::new(frame.camera, frame.depth_m, truth))
+        Ok((Sight::new(frame.camera, frame.depth_m.clone(), truth), frame))
     }
 
     fn new(camera: Intrinsics, depth_m: Image<f32>, map_from_camera: Pose) -> Sight {

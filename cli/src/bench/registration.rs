@@ -6,7 +6,7 @@ use crate::source;
 use anyhow::{Context, ensure};
 use clap::Args;
 use coma_dataset::Sequence;
-use coma_geometry::{Pose, se3};
+use coma_geometry::{Matrix6, Pose, Tangent, se3};
 use coma_registration::{
     Alignment, Outcome, Prepared, Reason, Settings, Side, View, align_prepared, coarse, decide,
 };
@@ -102,16 +102,33 @@ struct Class {
     success: usize,
     wrong: usize,
     wrong_pairs: Vec<String>,
-    /// Of those that are not wrong, by the claimed information; 6 on average if it is right.
-    #[serde(skip)]
-    squared_errors: Vec<f64>,
+    /// By the claimed information; 6 on average if it is right.
     mean_squared_error: Option<f64>,
     median_squared_error: Option<f64>,
     /// Root mean squares.
     rms_cm: Option<f64>,
     rms_deg: Option<f64>,
-    #[serde(skip)]
-    errors: Vec<(f64, f64)>,
+    /// Those that are not wrong.
+    edges: Vec<EdgeError>,
+}
+
+/// An accepted motion: how wrong it is and how sure it claims to be.
+#[derive(Debug, Serialize)]
+struct EdgeError {
+    source: String,
+    target: String,
+    true_overlap: f64,
+    /// `log(truth^-1 * found)`: metres, then radians.
+    error: Tangent,
+    information: Matrix6,
+    effective_samples: usize,
+}
+
+impl EdgeError {
+    /// By the claimed information.
+    fn squared(&self) -> f64 {
+        (self.error.transpose() * self.information * self.error)[0]
+    }
 }
 
 #[derive(Serialize)]
@@ -158,10 +175,6 @@ fn one(spec: &str) -> anyhow::Result<Box<dyn Sequence>> {
     let mut sources = source::open(&[spec.to_owned()])?;
     ensure!(sources.len() == 1, "{spec} names {} sequences, one is needed", sources.len());
     Ok(sources.remove(0).sequence)
-}
-
-fn view(sequence: &dyn Sequence, index: usize) -> anyhow::Result<View> {
-    Ok(View::from_frame(&coma_dataset::sequence::rgbd_frame(sequence, index)?))
 }
 
 /// Metres and degrees, and whether an acceptance is wrong.
@@ -226,8 +239,9 @@ fn pair(
     settings: &Settings,
     seed: u64,
 ) -> anyhow::Result<Pair> {
-    let (source, target) = (view(sequence, src)?, view(sequence, dst)?);
-    let (seen_source, seen_target) = (Sight::of(sequence, src)?, Sight::of(sequence, dst)?);
+    let (seen_source, source) = Sight::of(sequence, src)?;
+    let (seen_target, target) = Sight::of(sequence, dst)?;
+    let (source, target) = (View::from_frame(&source), View::from_frame(&target));
     let (prepared, prepare_ms) = timed(|| {
         let source = Prepared::new(&source, settings, Side::Source)?;
         Ok::<_, Reason>((source, Prepared::new(&target, settings, Side::Target)?))
@@ -298,12 +312,9 @@ fn frames(
     settings: &Settings,
 ) -> anyhow::Result<Vec<Frame>> {
     let frame = |index| {
-        Ok(Frame {
-            name: format!("{name}{index}"),
-            place,
-            sight: Sight::of(sequence, index)?,
-            prepared: Prepared::new(&view(sequence, index)?, settings, Side::Source),
-        })
+        let (sight, frame) = Sight::of(sequence, index)?;
+        let prepared = Prepared::new(&View::from_frame(&frame), settings, Side::Source);
+        Ok(Frame { name: format!("{name}{index}"), place, sight, prepared })
     };
     (0..sequence.len()).step_by(every.max(1)).map(frame).collect()
 }
@@ -330,12 +341,11 @@ fn sweep(
         success: 0,
         wrong: 0,
         wrong_pairs: Vec::new(),
-        squared_errors: Vec::new(),
         mean_squared_error: None,
         median_squared_error: None,
         rms_cm: None,
         rms_deg: None,
-        errors: Vec::new(),
+        edges: Vec::new(),
     });
     let progress = crate::progress::steps(
         "pairs",
@@ -369,18 +379,27 @@ fn sweep(
                 ));
             } else {
                 class.success += succeeds(m, deg) as usize;
-                class.squared_errors.push(squared_error(&truth, &found));
-                class.errors.push((m * 100.0, deg));
+                class.edges.push(EdgeError {
+                    source: source.name.clone(),
+                    target: target.name.clone(),
+                    true_overlap: shared,
+                    error: se3::log(&truth.inv_mul(&found.target_from_source)),
+                    information: found.information,
+                    effective_samples: found.effective_samples,
+                });
             }
         }
     }
     progress.finish_and_clear();
-    for class in classes.iter_mut().filter(|c| !c.errors.is_empty()) {
-        let n = class.errors.len() as f64;
-        class.mean_squared_error = Some(class.squared_errors.iter().sum::<f64>() / n);
-        class.median_squared_error = Some(median(class.squared_errors.clone()));
-        class.rms_cm = Some((class.errors.iter().map(|e| e.0 * e.0).sum::<f64>() / n).sqrt());
-        class.rms_deg = Some((class.errors.iter().map(|e| e.1 * e.1).sum::<f64>() / n).sqrt());
+    for class in classes.iter_mut().filter(|c| !c.edges.is_empty()) {
+        let squared: Vec<f64> = class.edges.iter().map(EdgeError::squared).collect();
+        let mean = |of: &dyn Fn(&EdgeError) -> f64| {
+            class.edges.iter().map(of).sum::<f64>() / class.edges.len() as f64
+        };
+        class.rms_cm = Some(100.0 * mean(&|e| e.error.fixed_rows::<3>(0).norm_squared()).sqrt());
+        class.rms_deg = Some(mean(&|e| e.error.fixed_rows::<3>(3).norm_squared()).sqrt().to_degrees());
+        class.mean_squared_error = Some(mean(&EdgeError::squared));
+        class.median_squared_error = Some(median(squared));
     }
     Ok(classes.into_iter().filter(|c| c.tried > 0).collect())
 }

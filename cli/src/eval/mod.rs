@@ -68,8 +68,11 @@ pub struct Read {
     pub sources: Vec<Source>,
     faults: Vec<Vec<Fault>>,
     /// By agent, then component: frame and `map_from_camera`.
-    pub tracks: BTreeMap<(usize, usize), Vec<(usize, Pose)>>,
+    pub tracks: Tracks,
 }
+
+/// By agent, then component: frame and `map_from_camera`.
+pub type Tracks = BTreeMap<(usize, usize), Vec<(usize, Pose)>>;
 
 fn score_now(out: &Path, options: &Options) -> anyhow::Result<()> {
     let read = Read::open(out)?;
@@ -175,11 +178,7 @@ impl Read {
 }
 
 /// Reads the trajectory files; every pose finds its frame by its stamp's text.
-fn tracks(
-    out: &Path,
-    facts: &Facts,
-    sources: &[Source],
-) -> anyhow::Result<BTreeMap<(usize, usize), Vec<(usize, Pose)>>> {
+fn tracks(out: &Path, facts: &Facts, sources: &[Source]) -> anyhow::Result<Tracks> {
     let mut tracks = BTreeMap::new();
     for (agent, known) in facts.agents.iter().enumerate() {
         let sequence = &sources[agent].sequence;

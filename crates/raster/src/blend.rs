@@ -81,7 +81,8 @@ impl TileSurfels {
     /// A loop of its own: its cache misses overlap, as they would not between the blend's computations.
     fn fetch(&mut self, slots: &[u32], projected: &[Projected]) {
         self.projected.clear();
-        self.projected.extend(self.entries.iter().map(|entry| projected[slots[entry.rank as usize] as usize]));
+        self.projected
+            .extend(self.entries.iter().map(|entry| projected[slots[entry.rank as usize] as usize]));
     }
 }
 
@@ -101,7 +102,9 @@ pub(crate) struct Blend<'a, const DETAIL: bool, const NORMAL: bool, const GROWTH
 /// After so many surfels a block looks whether its pixels are done.
 const PATIENCE: usize = 4;
 
-impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd for Blend<'_, DETAIL, NORMAL, GROWTH> {
+impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
+    for Blend<'_, DETAIL, NORMAL, GROWTH>
+{
     type Output = ();
 
     #[inline(always)]
@@ -180,7 +183,8 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd for Bl
                     median.store(&mut out.median, at);
                 }
                 if NORMAL {
-                    let squared = normal[0].mul_add(normal[0], normal[1].mul_add(normal[1], normal[2] * normal[2]));
+                    let squared =
+                        normal[0].mul_add(normal[0], normal[1].mul_add(normal[1], normal[2] * normal[2]));
                     let length = squared.sqrt();
                     let scale = number(1e-12).less(length).select(one / length, zero);
                     for c in 0..3 {

@@ -143,7 +143,11 @@ struct Scratch {
 
 impl Scratch {
     fn new() -> Self {
-        Scratch { surfels: TileSurfels::default(), observed: ObservedTile::none(), images: TileImages::empty() }
+        Scratch {
+            surfels: TileSurfels::default(),
+            observed: ObservedTile::none(),
+            images: TileImages::empty(),
+        }
     }
 }
 

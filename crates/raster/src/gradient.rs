@@ -42,8 +42,8 @@ impl Sums {
         // By opacity: alpha is proportional to it.
         let opacity = s[13] / p.opacity;
         Sums([
-            s[0], s[1], s[2], s[3], s[4], s[5], by_n[0], by_n[1], s[9], s[10], s[11], s[12], opacity, s[14], s[15],
-            s[16],
+            s[0], s[1], s[2], s[3], s[4], s[5], by_n[0], by_n[1], s[9], s[10], s[11], s[12], opacity, s[14],
+            s[15], s[16],
         ])
     }
 

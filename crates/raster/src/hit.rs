@@ -1,9 +1,9 @@
 //! What one surfel does to a vector of pixels: both passes ask here, so that they agree to the bit.
 
+use crate::blend::TileImage;
 use crate::lanes::{Lanes, Mask};
 use crate::project::Projected;
 use crate::reach::per_block;
-use crate::blend::TileImage;
 use crate::{ALPHA_MAX, BLOCK, BLOCKS, LANES, RenderSettings, TILE};
 use coma_geometry::Intrinsics;
 use pulp::Simd;
@@ -126,7 +126,8 @@ impl<S: Simd> Hits<S> {
     #[inline(always)]
     pub fn of(simd: S, p: &Projected, pixels: &Pixels<S>, constants: &Constants<S>) -> Self {
         let number = |value: f32| Lanes::splat(simd, value);
-        let along = |v: &[f32; 3]| pixels.dx.mul_add(number(v[0]), pixels.dy.mul_add(number(v[1]), number(v[2])));
+        let along =
+            |v: &[f32; 3]| pixels.dx.mul_add(number(v[0]), pixels.dy.mul_add(number(v[1]), number(v[2])));
         let inv = number(1.0) / along(&p.n);
         let (u, v, z) = (along(&p.a) * inv, along(&p.b) * inv, number(p.k) * inv);
         let (ex, ey) = (pixels.x - number(p.pixel[0]), pixels.y - number(p.pixel[1]));

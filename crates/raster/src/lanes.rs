@@ -99,7 +99,7 @@ impl<S: Simd> Lanes<S> {
         let f = t - (shifted - magic);
         let p = number(1.535_336_7e-4);
         let p = p.mul_add(f, number(1.339_887_4e-3));
-        let p = p.mul_add(f, number(9.618_437_4e-3));
+        let p = p.mul_add(f, number(9.618_438e-3));
         let p = p.mul_add(f, number(5.550_332_5e-2));
         let p = p.mul_add(f, number(2.402_264_8e-1));
         let p = p.mul_add(f, number(6.931_472e-1));

@@ -1,10 +1,10 @@
 //! The chain rule from what is projected back to the surfels' own parameters.
 
+use crate::SubmapView;
 use crate::backward::{Gradients, SurfelGradients};
 use crate::forward::RenderState;
 use crate::gradient::{Named, Sums};
 use crate::project::{CameraFromSubmap, InCamera, Projected};
-use crate::SubmapView;
 use coma_geometry::{Intrinsics, Tangent};
 use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
@@ -142,11 +142,8 @@ impl Submap<'_> {
         let (px, py) = (g.pixel[0] * fx / c.z, g.pixel[1] * fy / c.z);
         by_center += Vector3::new(px, py, g.z - (px * c.x + py * c.y) / c.z);
         // Turning the disc about its own axes by w: d e1 = e2 w3 - n w2, d e2 = n w1 - e1 w3, d n = e1 w2 - e2 w1.
-        let rotation = [
-            by_e2.dot(&n) - by_n.dot(&e2),
-            by_n.dot(&e1) - by_e1.dot(&n),
-            by_e1.dot(&e2) - by_e2.dot(&e1),
-        ];
+        let rotation =
+            [by_e2.dot(&n) - by_n.dot(&e2), by_n.dot(&e1) - by_e1.dot(&n), by_e1.dot(&e2) - by_e2.dot(&e1)];
         let turn = c.cross(&by_center) + e1.cross(&by_e1) + e2.cross(&by_e2) + n.cross(&by_n);
         OneSurfel { center: by_center, rotation, scale, turn }
     }

@@ -31,11 +31,13 @@ pub fn scattered(camera: &Intrinsics, count: usize, hits: f32, seed: u64) -> Sur
     let spread_px = (area_px / (2.0 * std::f32::consts::PI * 4.7)).sqrt();
     (0..count)
         .map(|_| {
-            let (x, y) = (random.between(0.0, camera.width as f32), random.between(0.0, camera.height as f32));
+            let (x, y) =
+                (random.between(0.0, camera.width as f32), random.between(0.0, camera.height as f32));
             let z = random.between(1.0, 4.0);
             let (tilt, turn) = (random.between(0.0, 1.22), random.between(0.0, std::f32::consts::TAU));
             let lean = UnitQuaternion::from_scaled_axis(Vector3::new(turn.cos(), turn.sin(), 0.0) * tilt);
-            let roll = UnitQuaternion::from_scaled_axis(Vector3::z() * random.between(0.0, 3.14));
+            let roll =
+                UnitQuaternion::from_scaled_axis(Vector3::z() * random.between(0.0, std::f32::consts::PI));
             let size = spread_px * z / camera.fx as f32;
             let center: Vector3<f32> = camera.ray(x as f64, y as f64).cast() * z;
             surfel(

@@ -82,7 +82,8 @@ impl ObservedTile {
             let depth = test.observed_depth_m.get(origin[0] + x, origin[1] + y).copied().unwrap_or(0.0);
             if depth > 0.0 {
                 self.depth[i] = depth;
-                self.tolerance[i] = (test.sigma_factor * test.noise.sigma_m(depth)).max(test.relative * depth);
+                self.tolerance[i] =
+                    (test.sigma_factor * test.noise.sigma_m(depth)).max(test.relative * depth);
             }
         }
     }

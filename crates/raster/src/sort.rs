@@ -43,7 +43,11 @@ mod tests {
             .map(|slot| {
                 seed = seed.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
                 // Some depths are often the same, some are as large as they get.
-                let z = if slot % 3 == 0 { (seed >> 60) as f32 } else { f32::from_bits((seed >> 33) as u32 & 0x7f7f_ffff) };
+                let z = if slot % 3 == 0 {
+                    (seed >> 60) as f32
+                } else {
+                    f32::from_bits((seed >> 33) as u32 & 0x7f7f_ffff)
+                };
                 (z.to_bits() as u64) << 32 | slot
             })
             .collect();

@@ -24,7 +24,10 @@ pub(crate) struct Grid {
 
 impl Grid {
     pub fn of(camera: &Intrinsics) -> Self {
-        Grid { columns: (camera.width as usize).div_ceil(TILE), rows: (camera.height as usize).div_ceil(TILE) }
+        Grid {
+            columns: (camera.width as usize).div_ceil(TILE),
+            rows: (camera.height as usize).div_ceil(TILE),
+        }
     }
 
     pub fn count(&self) -> usize {

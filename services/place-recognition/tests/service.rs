@@ -137,7 +137,7 @@ async fn bad_pictures_are_refused_by_field_and_the_service_goes_on() {
     let (handle, mut client) = start(config).await;
     let good = describe_request(&frame(0));
     let camera = |f: &dyn Fn(&mut v1::Intrinsics)| {
-        let mut camera = good.camera.clone().unwrap();
+        let mut camera = good.camera.unwrap();
         f(&mut camera);
         Some(camera)
     };

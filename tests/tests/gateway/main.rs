@@ -3,9 +3,9 @@
 mod page;
 
 use coma_geometry::{se3, tum};
+use coma_tests::story::{self, Cast, Walk};
 use coma_viewer_gateway::{GatewayConfig, Server};
 use serde_json::{Value, json};
-use coma_tests::story::{self, Cast, Walk};
 
 const NAMES: [&str; 2] = ["agent-00", "agent-01"];
 const WALKS: [Walk; 2] = [Walk { first_frame: 0, frames: 65 }, Walk { first_frame: 10, frames: 65 }];
@@ -14,7 +14,14 @@ const WALKS: [Walk; 2] = [Walk { first_frame: 0, frames: 65 }, Walk { first_fram
 async fn the_gateway_shows_two_agents_and_the_map_that_they_made() {
     let cast = Cast::start(&NAMES).await;
     let listen = ([127, 0, 0, 1], 0).into();
-    let config = GatewayConfig { listen, agents: cast.urls(), ..GatewayConfig::default() };
+    // On a machine that is busy with mapping and a browser, agents may take their time.
+    let config = GatewayConfig {
+        listen,
+        agents: cast.urls(),
+        status_timeout_s: 30.0,
+        call_timeout_s: 120.0,
+        ..Default::default()
+    };
     let gateway = Server::start(config).await.unwrap();
     let page = page::Page::open(&gateway.url, WALKS[0].frames).await;
 

@@ -6,7 +6,7 @@ import { View } from "./view.js";
 
 const { $ } = panel;
 /** Between two looks at agents and submaps that still grow. */
-const POLL_MS = 1500;
+const POLL_MS = 2000;
 const FETCHES_AT_ONCE = 3;
 
 const state = new State();
@@ -37,7 +37,7 @@ const coma = {
 };
 window.coma = coma;
 
-/** Runs `work` soon, and not again while it is waiting or under way. */
+/** Runs `work` after so many milliseconds, and not again while it is waiting or under way. */
 function soon(work, after) {
   let [waiting, running, again] = [false, false, false];
   const run = async () => {
@@ -58,7 +58,7 @@ function soon(work, after) {
     if (running) again = true;
     else if (!waiting) {
       waiting = true;
-      setTimeout(run, after);
+      setTimeout(run, typeof after === "function" ? after() : after);
     }
   };
   return start;
@@ -77,7 +77,8 @@ const redraw = soon(() => {
   panel.map(state, view);
   panel.loops(state);
   panel.hint(state);
-}, 120);
+  // A machine that draws slowly has other things to do as well.
+}, () => Math.min(Math.max(120, 3 * view.frameMs), 5000));
 
 const getAgents = soon(async () => {
   state.setAgents((await json("api/v1/agents")).agents);

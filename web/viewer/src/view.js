@@ -30,6 +30,8 @@ export class View {
   shown = { surfels: true, trajectories: true, cameras: true, accepted: true, rejected: false, tint: false };
   budget = 2 ** 21;
   drawnSurfels = 0;
+  /** What drawing took the last time, milliseconds. */
+  frameMs = 0;
   #state;
   #scene = new Scene();
   #root = new Group();
@@ -72,7 +74,9 @@ export class View {
     requestAnimationFrame(() => {
       this.#wanted = false;
       this.#share();
+      const begin = performance.now();
       this.renderer.render(this.#scene, this.camera);
+      requestAnimationFrame(() => (this.frameMs = performance.now() - begin));
     });
   }
 

@@ -109,8 +109,8 @@ fn one(source: &Source, encoders: &Encoders, arguments: &Arguments) -> anyhow::R
     let progress = progress::steps(&source.agent, ids.len() as u64);
     let (mut sights, mut pictures) = (Vec::new(), Vec::new());
     for id in &ids {
-        sights.push(Sight::of(sequence, *id).with_context(|| source.spec.clone())?);
-        let frame = coma_dataset::sequence::rgbd_frame(sequence, *id)?;
+        let (sight, frame) = Sight::of(sequence, *id).with_context(|| source.spec.clone())?;
+        sights.push(sight);
         pictures.push(Picture { color: frame.color, depth_m: frame.depth_m });
         progress.inc(1);
     }

@@ -23,7 +23,7 @@ mod tests {
         let bytes = of_rows(&[vec![1.0, 2.0, 3.0], vec![4.0, 5.0, 6.0]]);
         assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00");
         let end = 10 + u16::from_le_bytes([bytes[8], bytes[9]]) as usize;
-        assert!(end % 64 == 0 && bytes[end - 1] == b'\n');
+        assert!(end.is_multiple_of(64) && bytes[end - 1] == b'\n');
         let header = std::str::from_utf8(&bytes[10..end]).unwrap();
         assert!(header.contains("'shape': (2, 3)"), "{header}");
         assert_eq!(bytes.len(), end + 24);

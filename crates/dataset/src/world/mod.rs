@@ -80,7 +80,7 @@ impl World {
             return refuse("frames", settings.frames as f64, "1 to 1000000");
         }
         let fps = settings.frames_per_second;
-        if !(fps.is_finite() && fps >= 0.1 && fps <= 1000.0) {
+        if !(0.1..=1000.0).contains(&fps) {
             return refuse("frames_per_second", fps, "0.1 to 1000");
         }
         let (width, height) = (settings.width as f64, settings.height as f64);

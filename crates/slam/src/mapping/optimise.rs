@@ -170,7 +170,12 @@ impl Adam {
     }
 
     /// One step. Surfels without any gradient (not seen) stay as they are.
-    pub fn step(&mut self, surfels: &mut SurfelCloud, gradients: &SurfelGradients, settings: &OptimiseSettings) {
+    pub fn step(
+        &mut self,
+        surfels: &mut SurfelCloud,
+        gradients: &SurfelGradients,
+        settings: &OptimiseSettings,
+    ) {
         self.resize(surfels.len());
         let rates: [f32; PARAMETERS] = std::array::from_fn(|k| match k {
             0..3 => settings.center_rate_m,
@@ -193,7 +198,9 @@ impl Adam {
             .enumerate()
             .for_each(|(part, (center, rotation, scale, opacity, color, first, second, steps))| {
                 for i in 0..center.len() {
-                    let Some(g) = gradient(gradients, part * PART + i, scale[i], opacity[i]) else { continue };
+                    let Some(g) = gradient(gradients, part * PART + i, scale[i], opacity[i]) else {
+                        continue;
+                    };
                     steps[i] = steps[i].saturating_add(1);
                     let change = moments(&mut first[i], &mut second[i], &g, steps[i], &rates);
                     apply(
@@ -222,7 +229,8 @@ fn gradient(
     let (s, k) = (gradients.scale_m[index], gradients.color[index]);
     // By the chain rule: d/d log s = s d/ds, d/d logit o = o (1 - o) d/do.
     let by_logit = gradients.opacity[index] * opacity * (1.0 - opacity);
-    let g = [c[0], c[1], c[2], r[0], r[1], r[2], s[0] * scale[0], s[1] * scale[1], by_logit, k[0], k[1], k[2]];
+    let g =
+        [c[0], c[1], c[2], r[0], r[1], r[2], s[0] * scale[0], s[1] * scale[1], by_logit, k[0], k[1], k[2]];
     (g.iter().any(|v| *v != 0.0) && g.iter().all(|v| v.is_finite())).then_some(g)
 }
 
@@ -289,7 +297,8 @@ pub fn optimise_once(
 ) -> (Loss, u64) {
     let camera_from_submap = target.submap_from_camera.inverse();
     let views = [SubmapView { surfels, camera_from_submap }];
-    let rendering = coma_raster::render_only(&views, &target.camera, render_settings, None, Outputs::OPTIMISING);
+    let rendering =
+        coma_raster::render_only(&views, &target.camera, render_settings, None, Outputs::OPTIMISING);
     let (loss, pixels) = loss(&rendering, target, settings);
     let gradients = coma_raster::backward(&views, &target.camera, render_settings, &rendering, &pixels);
     let hits = rendering.hits;

@@ -55,7 +55,9 @@ pub fn ssim_and_gradient(a: &Image<[f32; 3]>, b: &Image<[f32; 3]>) -> (f64, Imag
         for c in 0..3 {
             let [by_mean, by_squares, by_product] = &slopes[c].by;
             let source = |row: usize, plane: usize, out: &mut [f32]| {
-                out.copy_from_slice(&[by_mean, by_squares, by_product][plane][row * width..(row + 1) * width]);
+                out.copy_from_slice(
+                    &[by_mean, by_squares, by_product][plane][row * width..(row + 1) * width],
+                );
             };
             let mut blur = Blur::<3, _>::new(width, height, band * BAND, source);
             for (i, out) in out.chunks_mut(width).enumerate() {
@@ -144,8 +146,10 @@ fn similarity(moments: &[Vec<f32>; 4], by: [&mut [f32]; 3]) -> f64 {
         // By the mean, variance and covariance of the window; these depend on the mean too.
         let by_variance = -s * inverse * b1;
         let by_covariance = 2.0 * a1 * inverse;
-        by_mean[i] =
-            2.0 * my * a2 * inverse - 2.0 * mx * s * inverse * b2 - 2.0 * mx * by_variance - my * by_covariance;
+        by_mean[i] = 2.0 * my * a2 * inverse
+            - 2.0 * mx * s * inverse * b2
+            - 2.0 * mx * by_variance
+            - my * by_covariance;
         by_squares[i] = by_variance;
         by_product[i] = by_covariance;
         s

@@ -24,7 +24,7 @@ const RETRY: Duration = Duration::from_millis(500);
 type Client = PlaceRecognitionClient<Channel>;
 
 /// Describes this agent's anchors as they come.
-pub async fn describe(node: Arc<Node>, mut anchors: mpsc::UnboundedReceiver<AnchorJob>, mut client: Client) {
+pub async fn describe(node: Arc<Node>, mut anchors: mpsc::Receiver<AnchorJob>, mut client: Client) {
     while let Some(job) = anchors.recv().await {
         if let Err(e) = describe_one(&node, &mut client, &job).await {
             warn!(submap = %job.submap, error = %format!("{e:#}"), "an anchor could not be described: its place can't be recognised");
