@@ -89,7 +89,13 @@ pub fn hit(s: &OracleSurfel, x: f64, y: f64, camera: &Intrinsics, settings: &Ren
     ((s.opacity * (-0.5 * rho).exp()).min(ALPHA_MAX as f64), depth)
 }
 
-fn pixel(order: &[&OracleSurfel], x: f64, y: f64, camera: &Intrinsics, settings: &RenderSettings) -> OraclePixel {
+fn pixel(
+    order: &[&OracleSurfel],
+    x: f64,
+    y: f64,
+    camera: &Intrinsics,
+    settings: &RenderSettings,
+) -> OraclePixel {
     let (mut passing, mut depth_sum) = (1.0f64, 0.0f64);
     let mut out = OraclePixel::default();
     for s in order {

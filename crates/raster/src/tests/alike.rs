@@ -74,7 +74,9 @@ fn difference(a: &[f32], b: &[f32]) -> f64 {
 
 #[test]
 fn every_instruction_set_sees_the_same() {
-    let [portable, others @ ..] = &crate::architectures()[..] else { panic!("there is always the portable one") };
+    let [portable, others @ ..] = &crate::architectures()[..] else {
+        panic!("there is always the portable one")
+    };
     let truth = run(*portable, Outputs::ALL);
     for arch in others {
         let found = run(*arch, Outputs::ALL);

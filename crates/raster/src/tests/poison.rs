@@ -13,7 +13,8 @@ fn picture(surfels: &SurfelCloud) -> (Image<[f32; 3]>, SurfelGradients) {
     let triples = own.center_m.iter().chain(&own.rotation).chain(&own.color).flatten();
     let all = triples.chain(own.scale_m.iter().flatten()).chain(&own.opacity);
     assert!(all.into_iter().all(|v| v.is_finite()));
-    let images = [&rendering.depth_m, &rendering.median_depth_m, &rendering.depth_spread_m, &rendering.opacity];
+    let images =
+        [&rendering.depth_m, &rendering.median_depth_m, &rendering.depth_spread_m, &rendering.opacity];
     assert!(images.iter().flat_map(|image| image.pixels()).all(|v| v.is_finite()));
     let triples = rendering.color.pixels().iter().chain(rendering.normal.pixels());
     assert!(triples.flatten().all(|v| v.is_finite()));
@@ -99,7 +100,8 @@ fn surfels_seen_edge_on_agree_with_the_oracle() {
             color: [r.next(), r.next(), r.next()],
         }
     };
-    let cloud: SurfelCloud = [0.0, 1e-6, 1e-3, 0.02].into_iter().cycle().take(40).map(|off| disc(off, &mut r)).collect();
+    let cloud: SurfelCloud =
+        [0.0, 1e-6, 1e-3, 0.02].into_iter().cycle().take(40).map(|off| disc(off, &mut r)).collect();
     let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
     for settings in [smooth(), RenderSettings::default()] {
         let rendering = render(&views, &CAMERA, &settings, None);
