@@ -19,8 +19,6 @@ pub(crate) struct RenderState {
     pub grid: Grid,
     /// By slot.
     pub projected: Vec<Projected>,
-    /// Slots from near to far.
-    pub order: Vec<u32>,
     /// What was blended, one for each row of tiles.
     pub blended: Vec<BlendedRow>,
 }
@@ -105,7 +103,6 @@ pub struct Sorted<'a> {
 pub struct Tiled<'a> {
     view: View<'a>,
     projected: Vec<Projected>,
-    order: Vec<u32>,
     tiles: Tiles,
 }
 
@@ -130,14 +127,14 @@ impl<'a> Sorted<'a> {
     /// Finds the tiles.
     pub fn tile(self) -> Tiled<'a> {
         let tiles = Tiles::build(self.view.arch, &self.order, &self.reach, Grid::of(self.view.camera));
-        Tiled { view: self.view, projected: self.projected, order: self.order, tiles }
+        Tiled { view: self.view, projected: self.projected, tiles }
     }
 }
 
 impl Tiled<'_> {
     /// Blends and writes the images.
     pub fn blend(self, growth: Option<&GrowthTest<'_>>, outputs: Outputs) -> Rendering {
-        let Tiled { view: View { arch, camera, settings }, projected, order, tiles } = self;
+        let Tiled { view: View { arch, camera, settings }, projected, tiles } = self;
         let grid = Grid::of(camera);
         let mut out = empty(camera, growth.is_some(), outputs);
         let mut bands = Bands::new(&mut out, camera);
@@ -149,7 +146,7 @@ impl Tiled<'_> {
             for column in 0..grid.columns {
                 let tile = row * grid.columns + column;
                 let origin = grid.origin(tile);
-                scratch.surfels.gather(tiles.entries(tile), &order, &projected);
+                scratch.surfels.gather(tiles.entries(tile), &projected);
                 if let Some(test) = growth {
                     scratch.observed.read(test, origin);
                 }
@@ -165,7 +162,7 @@ impl Tiled<'_> {
             bands.into_par_iter().enumerate().map_init(Scratch::new, row).collect();
         out.hits = rows.iter().map(|(_, hits)| hits).sum();
         let blended = rows.into_iter().map(|(row, _)| row).collect();
-        out.state = RenderState { arch, grid, projected, order, blended };
+        out.state = RenderState { arch, grid, projected, blended };
         out
     }
 }
@@ -187,7 +184,6 @@ fn empty(camera: &Intrinsics, growth: bool, outputs: Outputs) -> Rendering {
             arch: Arch::Scalar,
             grid: Grid::default(),
             projected: Vec::new(),
-            order: Vec::new(),
             blended: Vec::new(),
         },
     }
