@@ -1,6 +1,6 @@
 //! `coma bench raster`: what rendering and its derivatives cost, stage by stage.
 
-use super::cpu::median;
+use super::cpu::{median, process_ms};
 use clap::Args;
 use coma_geometry::{Intrinsics, Pose};
 use coma_raster::{
@@ -12,7 +12,7 @@ use std::fmt::Write as _;
 use std::time::Instant;
 
 /// Renders made-up scenes forward and backward: surfels scattered all over the picture, and a surface as mapping makes
-/// it. Wall time, the least and the middle of all repeats.
+/// it. Wall time, the least and the middle of all repeats, and processor time.
 #[derive(Args)]
 pub struct Arguments {
     /// Pixels.
@@ -71,6 +71,8 @@ struct Row {
     backward_ms: Times,
     /// Forward, for the losses of mapping, and backward.
     step_ms: Times,
+    /// Processor time of that, of all threads: what it costs on a busy machine too.
+    step_processor_ms: Times,
     /// Forward with every output.
     all_outputs_ms: Times,
 }
@@ -115,7 +117,8 @@ fn measure(
     let views = [SubmapView { surfels: cloud, camera_from_submap: Pose::identity() }];
     let settings = RenderSettings::default();
     let forward = |outputs| render_only(&views, camera, &settings, None, outputs);
-    let [mut project, mut sort, mut tile, mut blend, mut back, mut step, mut all] = [const { Vec::new() }; 7];
+    let [mut project, mut sort, mut tile, mut blend, mut back, mut step, mut processor, mut all] =
+        [const { Vec::new() }; 8];
     let first = forward(Outputs::OPTIMISING);
     let pixels = derivatives(&first);
     for _ in 0..arguments.repeats.max(1) {
@@ -125,10 +128,12 @@ fn measure(
         let rendering = timed(&mut blend, || tiled.blend(None, Outputs::OPTIMISING));
         timed(&mut back, || backward(&views, camera, &settings, &rendering, &pixels));
         drop(rendering);
+        let before_ms = process_ms();
         timed(&mut step, || {
             let rendering = forward(Outputs::OPTIMISING);
             backward(&views, camera, &settings, &rendering, &pixels)
         });
+        processor.push(process_ms() - before_ms);
         timed(&mut all, || forward(Outputs::ALL));
     }
     Row {
@@ -145,6 +150,7 @@ fn measure(
         blend_ms: Times::of(blend),
         backward_ms: Times::of(back),
         step_ms: Times::of(step),
+        step_processor_ms: Times::of(processor),
         all_outputs_ms: Times::of(all),
     }
 }
@@ -160,9 +166,9 @@ fn derivatives(rendering: &Rendering) -> PixelGradients {
 
 fn table(rows: &[Row]) -> String {
     let mut out = String::from(
-        "Milliseconds of wall time, least / middle.\n\n\
-         | scene | surfels | pixels | hits per pixel | threads | project | sort | tile | blend | backward | forward + backward | forward, every output |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        "Milliseconds, least / middle: wall time, and processor time of forward + backward.\n\n\
+         | scene | surfels | pixels | hits per pixel | threads | project | sort | tile | blend | backward | forward + backward | processor | forward, every output |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
     );
     for r in rows {
         let stages = [
@@ -172,6 +178,7 @@ fn table(rows: &[Row]) -> String {
             &r.blend_ms,
             &r.backward_ms,
             &r.step_ms,
+            &r.step_processor_ms,
             &r.all_outputs_ms,
         ];
         let times: Vec<String> = stages.iter().map(|t| format!("{:.1} / {:.1}", t.least, t.middle)).collect();
