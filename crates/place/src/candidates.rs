@@ -14,15 +14,16 @@ use std::collections::{BTreeMap, BTreeSet};
 pub struct Settings {
     /// Within one life of one agent, anchors must be more than this many frames apart (the paper's tau_min).
     pub min_gap_frames: u64,
-    /// Anchors to either side that belong to a window.
-    pub window: u32,
+    /// Anchors at most this many frames before or after belong to an anchor's window. Frames, not anchors: what
+    /// counts is how far the camera has moved on. Calibrated on a real kitchen; wider ones see another place.
+    pub window_frames: u64,
     /// Most similar anchors that are looked at per query.
     pub nearest: usize,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Settings { min_gap_frames: 20, window: 2, nearest: 20 }
+        Settings { min_gap_frames: 20, window_frames: 25, nearest: 20 }
     }
 }
 
@@ -37,7 +38,7 @@ pub struct Candidate {
     pub space: Space,
     /// Cosine of the two anchors.
     pub similarity: f32,
-    /// Mean cosine over all pairs of the two windows.
+    /// Mean cosine of the anchors of both windows with their best counterparts in the other window.
     pub window_similarity: f32,
 }
 
@@ -167,21 +168,46 @@ impl Candidates {
         }
     }
 
-    /// The ids from `window` before to `window` after, of the same life.
+    /// The anchors of the same life within [`Settings::window_frames`], `id` included; none for an unknown one.
     fn window(&self, id: &SubmapId) -> Vec<SubmapId> {
-        let first = id.number.saturating_sub(self.settings.window);
-        let last = id.number.saturating_add(self.settings.window);
-        (first..=last).map(|number| SubmapId { number, ..id.clone() }).collect()
+        let Some(anchor) = self.anchors.get(id) else { return Vec::new() };
+        let near = |(other, known): &(&SubmapId, &Anchor)| {
+            other.agent == id.agent
+                && other.epoch == id.epoch
+                && known.frame.abs_diff(anchor.frame) <= self.settings.window_frames
+        };
+        let before = self.anchors.range(..id).rev().take_while(near).map(|(other, _)| other.clone());
+        let mut ids: Vec<SubmapId> = before.collect();
+        ids.reverse();
+        ids.extend(self.anchors.range(id..).take_while(near).map(|(other, _)| other.clone()));
+        ids
     }
 
-    /// Mean similarity over all pairs of the two windows that have descriptors of the space.
+    /// How alike two windows are: each anchor's best counterpart in the other window, on average. The paper takes
+    /// the mean over all pairs, which also asks that the ends of both windows look alike; on a real kitchen the
+    /// best counterparts tell a place from another more often. Neighbours in time are no counterparts.
     fn window_similarity(&self, a: &SubmapId, b: &SubmapId, space: &Space) -> f32 {
-        let of = |id: &SubmapId| -> Vec<&Descriptor> {
-            self.window(id).iter().filter_map(|id| self.anchors.get(id)?.descriptors.get(space)).collect()
+        let of = |id: &SubmapId| -> Vec<(SubmapId, &Descriptor)> {
+            let known = |id: SubmapId| Some((id.clone(), self.anchors.get(&id)?.descriptors.get(space)?));
+            self.window(id).into_iter().filter_map(known).collect()
         };
         let (left, right) = (of(a), of(b));
-        let all: Vec<f32> = left.iter().flat_map(|x| right.iter().filter_map(|y| similarity(x, y))).collect();
-        if all.is_empty() { f32::NEG_INFINITY } else { all.iter().sum::<f32>() / all.len() as f32 }
+        let mut best: Vec<f32> = vec![f32::NEG_INFINITY; left.len() + right.len()];
+        for (i, (x, from)) in left.iter().enumerate() {
+            for (j, (y, to)) in right.iter().enumerate() {
+                let alike = similarity(from, to).filter(|_| self.far_enough(x, y));
+                for at in [i, left.len() + j] {
+                    best[at] = best[at].max(alike.unwrap_or(f32::NEG_INFINITY));
+                }
+            }
+        }
+        let (mut left, mut right) = (best[..left.len()].to_vec(), best[left.len()..].to_vec());
+        let mean = |best: &mut Vec<f32>| {
+            best.retain(|s| s.is_finite());
+            best.iter().sum::<f32>() / best.len() as f32
+        };
+        // Without any counterpart NaN, which passes no threshold.
+        0.5 * (mean(&mut left) + mean(&mut right))
     }
 }
 
@@ -218,7 +244,7 @@ mod tests {
     }
 
     fn empty() -> Candidates {
-        let thresholds = Thresholds { theta_sim: 0.8, theta_multi: 0.3 };
+        let thresholds = Thresholds { theta_sim: 0.8, theta_multi: 0.5 };
         Candidates::new(Settings::default(), BTreeMap::from([(space(), thresholds)]))
     }
 
@@ -250,6 +276,36 @@ mod tests {
             known.insert(id("d", n), n as u64 * 20, at(0, 0.1 * n as f32));
         }
         assert!(known.propose(&id("d", 2)).iter().any(|c| c.a == id("c", 2) && c.b == id("d", 2)));
+    }
+
+    #[test]
+    fn windows_are_as_alike_as_their_best_counterparts() {
+        let mut known = empty();
+        // The same walk, there and back; then anchors that are too far on to count.
+        for n in 0..5u32 {
+            known.insert(id("a", n), n as u64 * 20, at(n as usize, 0.0));
+            known.insert(id("b", n), n as u64 * 20, at(4 - n as usize, 0.0));
+        }
+        let found = known.propose(&id("b", 2));
+        let middle = found.iter().find(|c| c.a == id("a", 2) && c.b == id("b", 2)).unwrap();
+        assert!((middle.window_similarity - 1.0).abs() < 1e-6);
+        // Seen once more by itself, the middle of a has two strange neighbours.
+        known.insert(id("c", 0), 0, at(2, 0.0));
+        let found = known.of(&id("c", 0));
+        let lone = found.iter().find(|c| c.a == id("a", 2)).unwrap();
+        assert!((lone.window_similarity - 0.5 * (1.0 / 3.0 + 1.0)).abs() < 1e-6, "{}", lone.window_similarity);
+    }
+
+    #[test]
+    fn neighbours_in_time_are_no_counterparts() {
+        let mut known = empty();
+        // One walk whose two windows share an anchor in the middle: it must not vouch for both.
+        known.insert(id("a", 0), 0, at(0, 0.0));
+        known.insert(id("a", 1), 20, at(5, 0.0));
+        known.insert(id("a", 2), 40, at(0, 0.1));
+        let found = known.of(&id("a", 2));
+        let similarity = found[0].window_similarity;
+        assert!((similarity - found[0].similarity).abs() < 1e-6, "{similarity}");
     }
 
     #[test]

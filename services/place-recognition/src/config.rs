@@ -86,7 +86,7 @@ impl PlaceRecognitionConfig {
         };
         within("models", self.models.len(), 0, MAX_MODELS)?;
         within("onnx.threads", self.onnx.threads, 1, 256)?;
-        within("candidates.window", self.candidates.window as usize, 0, 16)?;
+        within("candidates.window_frames", self.candidates.window_frames as usize, 0, 1000)?;
         within("candidates.nearest", self.candidates.nearest, 1, 1000)?;
         within("max_indices", self.max_indices, 1, 10_000)?;
         within("max_anchors_per_index", self.max_anchors_per_index, 1, 10_000_000)?;

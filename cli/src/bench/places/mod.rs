@@ -23,7 +23,8 @@ use std::path::PathBuf;
 ///
 /// recall@1: frames with a match (a view over --gap frames apart that shares at least 40 %) whose best candidate is
 /// one. AP: average precision of the matches among all pairs. No false pair: share of the matches scored above every
-/// pair that shares less than 10 %; then the same by the mean over windows of frames. Perturbed hit: views of other
+/// pair that shares less than 10 %; then the same by windows, as
+/// candidates are verified: the mean over the best counterparts. Perturbed hit: views of other
 /// gamma or colours, cropped, or blurred, whose best candidate lies within 12 frames.
 #[derive(Args)]
 pub struct Arguments {
@@ -129,7 +130,7 @@ fn one(source: &Source, encoders: &Encoders, arguments: &Arguments) -> anyhow::R
         let known = Known {
             ids: &ids,
             gap: arguments.gap,
-            window: coma_place::Settings::default().window as usize,
+            window: coma_place::Settings::default().window_frames as usize,
             overlap: &overlap,
             similarity: &matrix,
             perturbed: &perturbed,
