@@ -7,6 +7,7 @@ mod demo;
 mod eval;
 mod export;
 mod fault;
+mod inspect;
 mod inspect_loops;
 mod play;
 mod progress;
@@ -57,6 +58,8 @@ enum Command {
 #[derive(Subcommand)]
 enum Inspect {
     Loops(inspect_loops::Arguments),
+    /// A pose graph (g2o): cost, residuals, weights, and whether its minimum is the global one.
+    Graph(inspect::GraphArguments),
 }
 
 #[tokio::main]
@@ -74,6 +77,7 @@ async fn main() -> anyhow::Result<()> {
         Command::Stream(arguments) => play::run(arguments).await,
         Command::Export(arguments) => export::run(arguments).await,
         Command::Inspect(Inspect::Loops(arguments)) => inspect_loops::run(&arguments),
+        Command::Inspect(Inspect::Graph(arguments)) => inspect::graph(&arguments),
         Command::Synth(synth) => synth::run(&synth),
         Command::Bench(bench) => bench::run(&bench),
     }
@@ -85,6 +89,7 @@ fn init_logging(command: &Command) -> anyhow::Result<()> {
         command,
         Command::Agent(_) | Command::PlaceRecognition(_) | Command::Dpgo(_) | Command::Gateway(_)
     );
-    let filter = std::env::var("RUST_LOG").unwrap_or_else(|_| if serves { "info".into() } else { "warn".into() });
+    let filter =
+        std::env::var("RUST_LOG").unwrap_or_else(|_| if serves { "info".into() } else { "warn".into() });
     Ok(coma_runtime::logging::init(&coma_runtime::LogSettings { filter, ..Default::default() })?)
 }

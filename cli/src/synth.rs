@@ -1,5 +1,7 @@
 //! `coma synth`: the built-in world as files.
 
+pub mod graph;
+
 use crate::progress;
 use anyhow::Context;
 use clap::{Args, Subcommand};
@@ -11,6 +13,7 @@ use std::path::PathBuf;
 pub enum Synth {
     /// RGB-D sequences of the built-in flat in the TUM layout, with exact poses: one folder for each agent.
     Rooms(RoomsArguments),
+    Graph(graph::Arguments),
 }
 
 /// Films the built-in flat.
@@ -43,6 +46,7 @@ pub struct RoomsArguments {
 pub fn run(synth: &Synth) -> anyhow::Result<()> {
     match synth {
         Synth::Rooms(arguments) => rooms(arguments),
+        Synth::Graph(arguments) => graph::run(arguments),
     }
 }
 

@@ -101,7 +101,8 @@ impl Normal {
     fn next(&mut self) -> f32 {
         let mut sum = 0.0;
         for _ in 0..4 {
-            self.state = self.state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            self.state =
+                self.state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
             sum += (self.state >> 40) as f32 / (1u64 << 24) as f32 - 0.5;
         }
         // Four uniform numbers have a variance of a third together.

@@ -1,11 +1,16 @@
 //! Figures as tables: each bench measures one part.
 
+mod blocks;
+mod clock;
 mod cpu;
 pub mod depth;
+pub mod graph;
 pub mod index;
 mod overlap;
 pub mod places;
 pub mod registration;
+pub mod robust;
+pub mod sets;
 pub mod tracking;
 
 use clap::Subcommand;
@@ -19,6 +24,8 @@ pub enum Bench {
     Places(places::Arguments),
     Index(index::Arguments),
     Depth(depth::Arguments),
+    Graph(graph::Arguments),
+    Robust(robust::Arguments),
 }
 
 /// Runs it.
@@ -29,5 +36,7 @@ pub fn run(bench: &Bench) -> anyhow::Result<()> {
         Bench::Places(arguments) => places::run(arguments),
         Bench::Index(arguments) => index::run(arguments),
         Bench::Depth(arguments) => depth::run(arguments),
+        Bench::Graph(arguments) => graph::run(arguments),
+        Bench::Robust(arguments) => robust::run(arguments),
     }
 }

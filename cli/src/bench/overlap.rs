@@ -3,8 +3,8 @@
 use anyhow::Context;
 use coma_dataset::Sequence;
 use coma_frame::{Image, RgbdFrame};
-use coma_geometry::{Intrinsics, Pose};
 use coma_geometry::nalgebra::Point3;
+use coma_geometry::{Intrinsics, Pose};
 
 /// Pixels between two points that are looked at.
 const STEP: usize = 16;

@@ -7,7 +7,9 @@ use anyhow::{Context, ensure};
 use clap::Args;
 use coma_dataset::Sequence;
 use coma_geometry::{Matrix6, Pose, Tangent, se3};
-use coma_registration::{Alignment, Outcome, Prepared, Reason, Settings, Side, View, align_prepared, coarse, decide};
+use coma_registration::{
+    Alignment, Outcome, Prepared, Reason, Settings, Side, View, align_prepared, coarse, decide,
+};
 use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -192,7 +194,12 @@ fn succeeds(m: f64, deg: f64) -> bool {
     m < 0.05 && deg < 3.0
 }
 
-fn pairs(sequence: &dyn Sequence, file: &Path, settings: &Settings, seed: u64) -> anyhow::Result<PairsReport> {
+fn pairs(
+    sequence: &dyn Sequence,
+    file: &Path,
+    settings: &Settings,
+    seed: u64,
+) -> anyhow::Result<PairsReport> {
     let text = std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
     let asked: Vec<Asked> = serde_json::from_str(&text).with_context(|| file.display().to_string())?;
     let mut rows = Vec::new();
@@ -202,7 +209,8 @@ fn pairs(sequence: &dyn Sequence, file: &Path, settings: &Settings, seed: u64) -
         rows.push(pair(sequence, src, dst, settings, seed)?);
     }
     let wrong = |r: &&Pair| r.accepted && !(r.error_cm <= Some(10.0) && r.error_deg <= Some(5.0));
-    let success = |r: &&Pair| r.accepted && succeeds(r.error_cm.unwrap_or(1e9) / 100.0, r.error_deg.unwrap_or(1e9));
+    let success =
+        |r: &&Pair| r.accepted && succeeds(r.error_cm.unwrap_or(1e9) / 100.0, r.error_deg.unwrap_or(1e9));
     let of = |value: fn(&Pair) -> Option<f64>| median(rows.iter().filter_map(value).collect());
     let squared: Vec<f64> = rows.iter().filter_map(|r| r.squared_error).collect();
     let total = |r: &Pair| r.prepare_ms + r.coarse_ms + r.refine_ms;
@@ -224,7 +232,13 @@ fn pairs(sequence: &dyn Sequence, file: &Path, settings: &Settings, seed: u64) -
 }
 
 /// The steps of [`coma_registration::align()`], each timed.
-fn pair(sequence: &dyn Sequence, src: usize, dst: usize, settings: &Settings, seed: u64) -> anyhow::Result<Pair> {
+fn pair(
+    sequence: &dyn Sequence,
+    src: usize,
+    dst: usize,
+    settings: &Settings,
+    seed: u64,
+) -> anyhow::Result<Pair> {
     let (seen_source, source) = Sight::of(sequence, src)?;
     let (seen_target, target) = Sight::of(sequence, dst)?;
     let (source, target) = (View::from_frame(&source), View::from_frame(&target));
@@ -333,7 +347,10 @@ fn sweep(
         rms_deg: None,
         edges: Vec::new(),
     });
-    let progress = crate::progress::steps("pairs", (own.len() * (own.len() - 1) / 2 + own.len() * strangers.len()) as u64);
+    let progress = crate::progress::steps(
+        "pairs",
+        (own.len() * (own.len() - 1) / 2 + own.len() * strangers.len()) as u64,
+    );
     for (i, source) in own.iter().enumerate() {
         for target in &all[i + 1..] {
             progress.inc(1);
@@ -354,7 +371,12 @@ fn sweep(
             let (m, deg, is_far) = error(&truth, &found.target_from_source);
             if shared < 0.01 || is_far {
                 class.wrong += 1;
-                class.wrong_pairs.push(format!("{} and {}: {deg:.1} degrees, {:.1} cm", source.name, target.name, m * 100.0));
+                class.wrong_pairs.push(format!(
+                    "{} and {}: {deg:.1} degrees, {:.1} cm",
+                    source.name,
+                    target.name,
+                    m * 100.0
+                ));
             } else {
                 class.success += succeeds(m, deg) as usize;
                 class.edges.push(EdgeError {

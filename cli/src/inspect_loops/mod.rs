@@ -86,7 +86,8 @@ fn table(read: &Read, listed: &[(usize, &LoopFacts)]) -> String {
     );
     for (number, l) in listed {
         let frame = |end: &End| end.frame.map_or("-".to_owned(), |f| f.to_string());
-        let numbers: Vec<String> = l.numbers.iter().map(|(name, value)| format!("{name} {}", short(*value))).collect();
+        let numbers: Vec<String> =
+            l.numbers.iter().map(|(name, value)| format!("{name} {}", short(*value))).collect();
         let why = l.message.as_deref().or(l.reason.as_deref()).or(l.solver.as_deref()).unwrap_or("");
         let error = true_error(read, l)
             .map_or(String::new(), |(m, rad)| format!("{:.1} cm, {:.2} deg", m * 100.0, rad.to_degrees()));

@@ -183,6 +183,13 @@ impl G2oGraph {
 
     /// Reads a text. Never panics; allocates no more than the limits and the text's own size imply.
     pub fn parse_within(text: &str, limits: &G2oLimits) -> Result<Self, G2oError> {
+        let graph = Self::parse_part(text, limits)?;
+        graph.check()?;
+        Ok(graph)
+    }
+
+    /// Reads one of several texts that are one graph together: edges may name vertices that are in another.
+    pub fn parse_part(text: &str, limits: &G2oLimits) -> Result<Self, G2oError> {
         let mut graph = G2oGraph::default();
         for (index, full) in text.lines().enumerate() {
             let number = index + 1;
@@ -207,12 +214,17 @@ impl G2oGraph {
                 _ => return Err(G2oError::Tag { line: number, tag: cut(tag) }),
             }
         }
-        for (edge, e) in graph.edges.iter().enumerate() {
-            if let Some(id) = [e.from, e.to].into_iter().find(|id| !graph.vertices.contains_key(id)) {
+        Ok(graph)
+    }
+
+    /// Refuses edges whose vertices are missing.
+    pub fn check(&self) -> Result<(), G2oError> {
+        for (edge, e) in self.edges.iter().enumerate() {
+            if let Some(id) = [e.from, e.to].into_iter().find(|id| !self.vertices.contains_key(id)) {
                 return Err(G2oError::UnknownVertex { edge, id });
             }
         }
-        Ok(graph)
+        Ok(())
     }
 
     fn read_vertex(&mut self, line: &Line, limits: &G2oLimits) -> Result<(), G2oError> {

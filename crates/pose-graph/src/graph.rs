@@ -216,7 +216,8 @@ fn checked_information(information: &Matrix6) -> Result<Matrix6, EntryProblem> {
     Ok(symmetric)
 }
 
-fn checked_edge(edge: &Edge, nodes: &BTreeMap<SubmapId, NodeInfo>) -> Result<Edge, EntryProblem> {
+/// An edge with a sound pose and information between two known submaps, or what is wrong with it.
+pub(crate) fn checked_edge(edge: &Edge, known: impl Fn(&SubmapId) -> bool) -> Result<Edge, EntryProblem> {
     if edge.from == edge.to {
         return Err(EntryProblem::SelfEdge);
     }
@@ -226,7 +227,7 @@ fn checked_edge(edge: &Edge, nodes: &BTreeMap<SubmapId, NodeInfo>) -> Result<Edg
     }
     let from_from_to = checked_pose(&edge.from_from_to)?;
     let information = checked_information(&edge.information)?;
-    if let Some(submap) = [&edge.from, &edge.to].into_iter().find(|s| !nodes.contains_key(s)) {
+    if let Some(submap) = [&edge.from, &edge.to].into_iter().find(|s| !known(s)) {
         return Err(EntryProblem::UnknownNode { submap: submap.clone() });
     }
     Ok(Edge { from_from_to, information, ..edge.clone() })
@@ -274,7 +275,7 @@ impl UsableGraph {
         let mut also_in_cut = BTreeSet::new();
         for edge in one_per_key(&entries.edges, &mut graph.rejected) {
             let name = EntryName::Edge(edge.key.clone());
-            let edge = match checked_edge(&edge, &graph.nodes) {
+            let edge = match checked_edge(&edge, |s| graph.nodes.contains_key(s)) {
                 Ok(edge) => edge,
                 Err(problem) => {
                     graph.rejected.push((name, problem));

@@ -1,8 +1,9 @@
 //! Where to start: poses good enough for the solver to end at the right place.
 
+use crate::isotropic::Isotropic;
 use crate::solver::{Problem, SolveError};
 use crate::sparse::BlockCholesky;
-use coma_geometry::{Matrix6, Pose};
+use coma_geometry::Pose;
 use nalgebra::{Matrix3, Rotation3, SMatrix, Translation3, UnitQuaternion, Vector3};
 use std::collections::VecDeque;
 
@@ -36,18 +37,6 @@ pub fn spanning_tree(problem: &Problem, start: &[Pose], weights: &[f64]) -> Resu
         }
     }
     Ok(poses)
-}
-
-/// Isotropic weights of a measurement as SE-Sync takes them (Rosen 2019): `(kappa, tau)` for rotation and
-/// translation.
-fn isotropic(information: &Matrix6) -> (f64, f64) {
-    let harmonic = |block: Matrix3<f64>| {
-        let trace = block.try_inverse().map_or(0.0, |inverse| inverse.trace());
-        if trace > 0.0 && trace.is_finite() { 3.0 / trace } else { block.trace() / 3.0 }
-    };
-    let tau = harmonic(information.fixed_view::<3, 3>(0, 0).into_owned());
-    let kappa = 0.5 * harmonic(information.fixed_view::<3, 3>(3, 3).into_owned());
-    (kappa.max(1e-12), tau.max(1e-12))
 }
 
 /// Chordal initialisation (Carlone et al., ICRA 2015): rotations from the relaxed linear problem
@@ -177,7 +166,7 @@ fn chordal_rotations(
         .map(|(c, w)| LinearTerm {
             from: c.from,
             to: c.to,
-            weight: w * isotropic(&c.information).0,
+            weight: w * Isotropic::of(&c.information).kappa,
             a: matrix(&c.from_from_to).transpose(),
             b: Matrix3::zeros(),
         })
@@ -217,7 +206,7 @@ fn linear_translations(
         .map(|(c, w)| LinearTerm {
             from: c.from,
             to: c.to,
-            weight: w * isotropic(&c.information).1,
+            weight: w * Isotropic::of(&c.information).tau,
             a: SMatrix::<f64, 1, 1>::identity(),
             b: (rotations[c.from] * c.from_from_to.translation.vector).transpose(),
         })
@@ -229,7 +218,7 @@ fn linear_translations(
 mod tests {
     use super::*;
     use crate::solver::Constraint;
-    use coma_geometry::{Tangent, se3};
+    use coma_geometry::{Matrix6, Tangent, se3};
 
     /// A ring with a chord; poses far from the identity, measured exactly.
     fn ring() -> (Problem, Vec<Pose>) {

@@ -5,10 +5,13 @@
 //! * [`residual`]: the error of one edge (eq. 11) and its Jacobians.
 //! * [`sparse`], [`solver`]: Levenberg-Marquardt over a sparse block Cholesky factorisation.
 //! * [`initialise`]: starts from a spanning tree or from the chordal relaxation.
+//! * [`isotropic`], [`certificate`], [`certified`]: is the minimum the global one?
 //! * [`gnc`], [`clique`], [`consistency`]: which loops to believe.
 //! * [`chain`], [`relative`]: which trajectories may join, and where they stand to each other (eq. 12).
 //! * [`global`]: the canonical solve of everything that is known (eq. 10); [`solution`] is its result.
-//! * [`covariance`]: how sure a pose is. [`g2o`]: files.
+//! * [`preview`]: what a new measurement does to the last result, at once and provisionally.
+//! * [`blocks`]: the same without anyone who holds the whole graph.
+//! * [`covariance`]: how sure a pose is. [`g2o`], [`team`]: files.
 //!
 //! Everything is `f64`, single-threaded, and a function of its arguments: the same entries in any order
 //! give the same bits.
@@ -18,6 +21,9 @@
     reason = "guards are positive, so that NaN falls on the safe side"
 )]
 
+pub mod blocks;
+pub mod certificate;
+pub mod certified;
 pub mod chain;
 pub mod clique;
 pub mod consistency;
@@ -27,14 +33,18 @@ pub mod global;
 pub mod gnc;
 pub mod graph;
 pub mod initialise;
+pub mod isotropic;
+mod lanczos;
+pub mod preview;
 pub mod relative;
 pub mod residual;
 pub mod solution;
 pub mod solver;
 pub mod sparse;
+pub mod team;
 pub mod uncertain;
 
 pub use global::{GlobalSettings, solve};
 pub use graph::{Edge, EdgeKey, EdgeKind, GraphEntries, NodeInfo};
 pub use solution::{Component, Generation, LoopVerdict, LoopWeight, MapId, Solution};
-pub use solver::{Constraint, Problem, SolveError, Solved, SolverSettings};
+pub use solver::{Constraint, Objective, Problem, SolveError, Solved, SolverSettings};

@@ -1,9 +1,11 @@
 //! Levenberg-Marquardt over poses.
 
+use crate::isotropic::{Isotropic, Normal};
 use crate::residual::{linearise, residual, squared_mahalanobis};
 use crate::sparse::{BlockCholesky, BlockSlot, SparseError};
 use coma_geometry::{Matrix6, Pose, Tangent, se3};
 use serde::{Deserialize, Serialize};
+use std::borrow::Cow;
 
 /// One measurement between two nodes, by index.
 #[derive(Clone, Debug, PartialEq)]
@@ -35,6 +37,16 @@ pub struct Problem {
     pub constraints: Vec<Constraint>,
     /// `fixed[node]`: the node keeps its start. At least one per connected part, or nothing holds it.
     pub fixed: Vec<bool>,
+}
+
+/// What is minimised.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Objective {
+    /// Eq. 10: half the sum of squared Mahalanobis errors, with the full information matrices.
+    #[default]
+    Mahalanobis,
+    /// SE-Sync's ([`crate::isotropic`]), of which optimality can be certified.
+    Isotropic,
 }
 
 /// When to stop, and how to damp.
@@ -109,7 +121,7 @@ pub enum SolveError {
 pub struct Solved {
     /// One pose per node.
     pub poses: Vec<Pose>,
-    /// Half the weighted sum of squared Mahalanobis errors at the start.
+    /// The objective at the start: half the weighted sum of squared Mahalanobis errors, or SE-Sync's.
     pub initial_cost: f64,
     /// The same at the end.
     pub cost: f64,
@@ -178,11 +190,13 @@ impl Problem {
 
 /// A problem with its ordering and symbolic factorisation, to be solved many times with changing weights.
 pub struct Solver<'a> {
-    problem: &'a Problem,
+    problem: Cow<'a, Problem>,
     /// Node to variable; `None` for fixed nodes.
     variable: Vec<Option<usize>>,
     system: BlockCholesky<6>,
     slots: Vec<ConstraintSlots>,
+    /// One per constraint; `None` for the full information.
+    isotropic: Option<Vec<Isotropic>>,
 }
 
 #[derive(Clone, Copy, Default)]
@@ -196,6 +210,20 @@ impl<'a> Solver<'a> {
     /// Checks the problem with the given weights, orders it and analyses its pattern. The pattern holds every
     /// constraint, so that weights may change from and to zero.
     pub fn new(problem: &'a Problem, weights: &[f64]) -> Result<Self, SolveError> {
+        Self::over(Cow::Borrowed(problem), weights)
+    }
+
+    /// The same for a problem that it keeps.
+    pub fn owning(problem: Problem, weights: &[f64]) -> Result<Solver<'static>, SolveError> {
+        Solver::over(Cow::Owned(problem), weights)
+    }
+
+    /// What is solved.
+    pub fn problem(&self) -> &Problem {
+        &self.problem
+    }
+
+    fn over(problem: Cow<'a, Problem>, weights: &[f64]) -> Result<Self, SolveError> {
         problem.check(weights)?;
         let mut next = 0;
         let variable: Vec<Option<usize>> = problem
@@ -230,7 +258,47 @@ impl<'a> Solver<'a> {
                 }
             })
             .collect();
-        Ok(Solver { problem, variable, system, slots })
+        Ok(Solver { problem, variable, system, slots, isotropic: None })
+    }
+
+    /// The same for another objective.
+    pub fn with_objective(
+        problem: &'a Problem,
+        weights: &[f64],
+        objective: Objective,
+    ) -> Result<Self, SolveError> {
+        let isotropic = match objective {
+            Objective::Mahalanobis => None,
+            Objective::Isotropic => {
+                Some(problem.constraints.iter().map(|c| Isotropic::of(&c.information)).collect())
+            }
+        };
+        Ok(Solver { isotropic, ..Solver::new(problem, weights)? })
+    }
+
+    /// The objective at these poses.
+    pub fn cost(&self, poses: &[Pose], weights: &[f64]) -> f64 {
+        let Some(isotropic) = &self.isotropic else { return self.problem.cost(poses, weights) };
+        let used = self.problem.constraints.iter().zip(isotropic).zip(weights).filter(|(_, w)| **w > 0.0);
+        used.map(|((c, term), w)| w * term.term(&poses[c.from], &poses[c.to], &c.from_from_to)).sum()
+    }
+
+    /// What constraint `k` adds to the normal equations, before its weight.
+    fn normal(&self, k: usize, poses: &[Pose]) -> Normal {
+        let c = &self.problem.constraints[k];
+        if let Some(isotropic) = &self.isotropic {
+            return isotropic[k].normal(&poses[c.from], &poses[c.to], &c.from_from_to);
+        }
+        let at = linearise(&poses[c.from], &poses[c.to], &c.from_from_to);
+        let i_omega = at.wrt_i.transpose() * c.information;
+        let j_omega = at.wrt_j.transpose() * c.information;
+        Normal {
+            ii: i_omega * at.wrt_i,
+            ij: i_omega * at.wrt_j,
+            jj: j_omega * at.wrt_j,
+            g_i: i_omega * at.error,
+            g_j: j_omega * at.error,
+        }
     }
 
     /// Fills the normal equations `H x = -g` at `poses`; returns the right-hand side `-g`.
@@ -242,23 +310,22 @@ impl<'a> Solver<'a> {
                 rhs[variable * 6 + k] -= value[k];
             }
         };
-        for ((c, slots), &weight) in self.problem.constraints.iter().zip(&self.slots).zip(weights) {
+        for (k, &weight) in weights.iter().enumerate() {
             if !(weight > 0.0) {
                 continue;
             }
-            let at = linearise(&poses[c.from], &poses[c.to], &c.from_from_to);
-            let information = c.information * weight;
-            let (i_omega, j_omega) = (at.wrt_i.transpose() * information, at.wrt_j.transpose() * information);
+            let (c, slots) = (&self.problem.constraints[k], self.slots[k]);
+            let normal = self.normal(k, poses);
             if let (Some(slot), Some(i)) = (slots.from, self.variable[c.from]) {
-                self.system.add(slot, &(i_omega * at.wrt_i));
-                add_rhs(i, i_omega * at.error);
+                self.system.add(slot, &(normal.ii * weight));
+                add_rhs(i, normal.g_i * weight);
             }
             if let (Some(slot), Some(j)) = (slots.to, self.variable[c.to]) {
-                self.system.add(slot, &(j_omega * at.wrt_j));
-                add_rhs(j, j_omega * at.error);
+                self.system.add(slot, &(normal.jj * weight));
+                add_rhs(j, normal.g_j * weight);
             }
             if let Some(slot) = slots.cross {
-                self.system.add(slot, &(i_omega * at.wrt_j));
+                self.system.add(slot, &(normal.ij * weight));
             }
         }
         rhs
@@ -285,9 +352,8 @@ impl<'a> Solver<'a> {
         weights: &[f64],
         asked: &[usize],
     ) -> Result<Vec<f64>, SolveError> {
-        let problem = self.problem;
-        let variable = self.variable.clone();
-        let system = self.factorise_at(poses, weights)?;
+        self.factorise_at(poses, weights)?;
+        let (problem, variable, system) = (&self.problem, &self.variable, &mut self.system);
         let n = system.blocks() * 6;
         let mut columns = vec![0.0; n * 6];
         Ok(asked
@@ -340,7 +406,7 @@ impl<'a> Solver<'a> {
         size("start poses", start.len(), self.problem.nodes)?;
         size("weights", weights.len(), self.problem.constraints.len())?;
         let mut poses = start.to_vec();
-        let initial_cost = self.problem.cost(&poses, weights);
+        let initial_cost = self.cost(&poses, weights);
         if !initial_cost.is_finite() {
             return Err(SolveError::NotFinite);
         }
@@ -372,7 +438,7 @@ impl<'a> Solver<'a> {
                         continue;
                     }
                 };
-                let new_cost = self.problem.cost(&candidate, weights);
+                let new_cost = self.cost(&candidate, weights);
                 if new_cost <= cost {
                     converged = cost - new_cost <= settings.relative_decrease * cost
                         || new_cost <= settings.absolute_cost;

@@ -2,16 +2,21 @@
 
 mod world;
 
+use coma_geometry::Pose;
+use coma_pose_graph::certified::{self, Start, attempt};
 use coma_pose_graph::g2o::G2oGraph;
 use coma_pose_graph::initialise::chordal;
-use coma_pose_graph::{Solved, SolverSettings};
+use coma_pose_graph::{Problem, Solved, SolverSettings};
 use std::time::Instant;
 use world::shared_data;
 
-fn optimum(name: &str) -> Solved {
+fn read(name: &str) -> (Problem, Vec<Pose>) {
     let path = shared_data().join("pose-graphs").join(name);
-    let graph = G2oGraph::parse(&std::fs::read_to_string(path).unwrap()).unwrap();
-    let (problem, start) = graph.problem();
+    G2oGraph::parse(&std::fs::read_to_string(path).unwrap()).unwrap().problem()
+}
+
+fn optimum(name: &str) -> Solved {
+    let (problem, start) = read(name);
     let weights = vec![1.0; problem.constraints.len()];
     let clock = Instant::now();
     let start = chordal(&problem, &start, &weights).unwrap();
@@ -56,4 +61,48 @@ fn sphere_reaches_the_known_cost() {
 #[ignore = "needs the shared data folder"]
 fn torus_reaches_the_known_cost() {
     reaches("torus3D.g2o", 12117.6);
+}
+
+/// SE-Sync's objective and certificate from a chordal start.
+fn is_certified(name: &str, objective: f64) {
+    let (problem, start) = read(name);
+    let weights = vec![1.0; problem.constraints.len()];
+    let start = chordal(&problem, &start, &weights).unwrap();
+    let end = attempt(&problem, Start::Chordal, &start, &weights, &SolverSettings::default()).unwrap();
+    println!(
+        "{name}: {} in {} iterations, {:?}",
+        end.isotropic.cost, end.isotropic.iterations, end.certificate
+    );
+    assert!((end.isotropic.cost / objective - 1.0).abs() < 1e-4, "{}", end.isotropic.cost);
+    assert!((end.certificate.objective / objective - 1.0).abs() < 1e-4);
+    assert!(end.certificate.holds(), "{:?}", end.certificate);
+}
+
+#[test]
+#[ignore = "needs the shared data folder"]
+fn minima_of_the_isotropic_objective_are_certified() {
+    is_certified("smallGrid3D.g2o", 1025.40);
+    is_certified("parking-garage.g2o", 1.26253);
+    is_certified("sphere2500.g2o", 1687.006);
+    is_certified("torus3D.g2o", 24227.09);
+}
+
+#[test]
+#[ignore = "needs the shared data folder"]
+fn the_torus_from_its_own_vertices_is_refused_and_solved_from_another_start() {
+    let (problem, start) = read("torus3D.g2o");
+    let weights = vec![1.0; problem.constraints.len()];
+    let attempts = certified::solve(&problem, &start, &weights, &SolverSettings::default()).unwrap();
+    for a in &attempts {
+        println!(
+            "{:?}: cost {}, isotropic {}, {:?}",
+            a.start, a.solved.cost, a.isotropic.cost, a.certificate
+        );
+    }
+    let [first, second] = &attempts[..] else { panic!("one attempt was enough") };
+    assert!(!first.certificate.holds() && first.isotropic.cost > 1.1 * 24227.09);
+    assert!(first.certificate.stationarity < 1e-3, "a local minimum: {:?}", first.certificate);
+    assert!(first.certificate.smallest < -1e-4 * first.certificate.largest, "{:?}", first.certificate);
+    assert!(second.certificate.holds());
+    assert!((second.solved.cost / 12117.6 - 1.0).abs() < 1e-4);
 }

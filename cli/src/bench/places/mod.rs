@@ -126,7 +126,8 @@ fn one(source: &Source, encoders: &Encoders, arguments: &Arguments) -> anyhow::R
             described.plain.iter().map(|other| similarity(from, other).unwrap_or(-1.0)).collect()
         };
         let matrix: Vec<Vec<f32>> = described.plain.iter().map(row).collect();
-        let perturbed: Vec<(usize, Vec<f32>)> = described.perturbed.iter().map(|(of, d)| (*of, row(d))).collect();
+        let perturbed: Vec<(usize, Vec<f32>)> =
+            described.perturbed.iter().map(|(of, d)| (*of, row(d))).collect();
         let known = Known {
             ids: &ids,
             gap: arguments.gap,
@@ -181,7 +182,10 @@ fn describe(pictures: &[Picture], encoder: &dyn Encoder) -> anyhow::Result<Descr
     Ok(Described { plain, perturbed, encode_ms: median(times_ms) })
 }
 
-fn write<'a>(path: &std::path::Path, descriptors: impl Iterator<Item = &'a Descriptor>) -> anyhow::Result<()> {
+fn write<'a>(
+    path: &std::path::Path,
+    descriptors: impl Iterator<Item = &'a Descriptor>,
+) -> anyhow::Result<()> {
     let values = |d: &Descriptor| d.values().iter().map(|v| *v as f32 * d.scale()).collect();
     let rows: Vec<Vec<f32>> = descriptors.map(values).collect();
     std::fs::write(path, npy::of_rows(&rows)).with_context(|| path.display().to_string())

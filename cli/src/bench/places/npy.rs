@@ -3,7 +3,8 @@
 /// A `.npy` file, version 1.0: little-endian floats, `[rows, columns]`. All rows are equally long.
 pub fn of_rows(rows: &[Vec<f32>]) -> Vec<u8> {
     let columns = rows.first().map_or(0, Vec::len);
-    let fields = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, {columns}), }}", rows.len());
+    let fields =
+        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, {columns}), }}", rows.len());
     // Magic, version and length take 10 bytes; what follows the header begins at a multiple of 64.
     let length = (10 + fields.len() + 1).next_multiple_of(64) - 10;
     let mut out = b"\x93NUMPY\x01\x00".to_vec();
@@ -22,7 +23,7 @@ mod tests {
         let bytes = of_rows(&[vec![1.0, 2.0, 3.0], vec![4.0, 5.0, 6.0]]);
         assert_eq!(&bytes[..8], b"\x93NUMPY\x01\x00");
         let end = 10 + u16::from_le_bytes([bytes[8], bytes[9]]) as usize;
-        assert!(end % 64 == 0 && bytes[end - 1] == b'\n');
+        assert!(end.is_multiple_of(64) && bytes[end - 1] == b'\n');
         let header = std::str::from_utf8(&bytes[10..end]).unwrap();
         assert!(header.contains("'shape': (2, 3)"), "{header}");
         assert_eq!(bytes.len(), end + 24);

@@ -56,8 +56,9 @@ fn blurred(image: &Image<[u8; 3]>) -> Image<[u8; 3]> {
         out
     };
     let (width, height) = (image.width(), image.height());
-    let across: Image<[f32; 3]> =
-        Image::from_fn(width, height, |x, y| mean(&|d| image[(mirrored(x as isize + d, width), y)].map(f32::from)));
+    let across: Image<[f32; 3]> = Image::from_fn(width, height, |x, y| {
+        mean(&|d| image[(mirrored(x as isize + d, width), y)].map(f32::from))
+    });
     let down = Image::from_fn(width, height, |x, y| mean(&|d| across[(x, mirrored(y as isize + d, height))]));
     down.map(|c| c.map(|v| v.round() as u8))
 }
@@ -65,7 +66,13 @@ fn blurred(image: &Image<[u8; 3]>) -> Image<[u8; 3]> {
 /// The pixel that a mirror at the border's pixel shows.
 fn mirrored(k: isize, length: usize) -> usize {
     let last = length as isize - 1;
-    let inside = if k < 0 { -k } else if k > last { 2 * last - k } else { k };
+    let inside = if k < 0 {
+        -k
+    } else if k > last {
+        2 * last - k
+    } else {
+        k
+    };
     inside.clamp(0, last) as usize
 }
 

@@ -68,7 +68,8 @@ impl Known<'_> {
                 continue;
             }
             queries += 1;
-            hits += best(&others, |j| self.similarity[i][j]).is_some_and(|j| self.overlap[i][j] >= SAME) as usize;
+            hits +=
+                best(&others, |j| self.similarity[i][j]).is_some_and(|j| self.overlap[i][j] >= SAME) as usize;
         }
         let pairs = |score: &dyn Fn(usize, usize) -> f32| -> Vec<(f32, f64)> {
             let all = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
@@ -167,11 +168,20 @@ mod tests {
         let overlap = vec![vec![1.0, 0.9, 0.5], vec![0.9, 1.0, 0.0], vec![0.5, 0.0, 1.0]];
         let similarity = vec![vec![1.0, 0.9, 0.5], vec![0.9, 1.0, 0.1], vec![0.5, 0.1, 1.0]];
         let perturbed = [(0, vec![0.8, 0.9, 0.1]), (2, vec![0.9, 0.1, 0.2])];
-        let known =
-            Known { ids: &ids, gap: 25, window: 0, overlap: &overlap, similarity: &similarity, perturbed: &perturbed };
+        let known = Known {
+            ids: &ids,
+            gap: 25,
+            window: 0,
+            overlap: &overlap,
+            similarity: &similarity,
+            perturbed: &perturbed,
+        };
         let scores = known.scores();
         assert_eq!((scores.queries, scores.pairs), (2, 1));
-        assert_eq!((scores.recall_at_1, scores.average_precision, scores.recall_without_false), (1.0, 1.0, 1.0));
+        assert_eq!(
+            (scores.recall_at_1, scores.average_precision, scores.recall_without_false),
+            (1.0, 1.0, 1.0)
+        );
         assert_eq!(scores.perturbed_hit, 0.5);
     }
 }

@@ -1,0 +1,342 @@
+//! One agent of a block-by-block solve, as a state machine: [`BlockAgent::receive`] takes what others say,
+//! [`BlockAgent::step`] descends once and gives what there is to say. It knows no clock and no network.
+
+use super::local::Local;
+use super::message::Boundary;
+use super::{Block, BlockId, NodeId};
+use crate::gnc::{Kernel, final_weight};
+use crate::solver::{Constraint, SolveError, SolverSettings};
+use coma_geometry::{Pose, Tangent, se3};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// How an agent descends.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BlockSettings {
+    /// Linear solves in one step.
+    pub iterations_per_step: u32,
+    /// Largest share of the last move that a step carries on with. 0 for plain descent; below 1.
+    pub most_momentum: f64,
+    /// A node that has moved by less than this since it was last told of, in metres,
+    pub still_m: f64,
+    /// and by less than this, in radians, is not told of again.
+    pub still_rad: f64,
+    /// Largest squared Mahalanobis error of a doubted measurement that is believed.
+    pub squared_error_6dof: f64,
+    /// How often a measurement's weight may change.
+    pub most_changes_of_weight: u32,
+}
+
+impl Default for BlockSettings {
+    fn default() -> Self {
+        BlockSettings {
+            iterations_per_step: 3,
+            most_momentum: 0.7,
+            still_m: 1e-5,
+            still_rad: 1e-6,
+            squared_error_6dof: 22.458,
+            most_changes_of_weight: 4,
+        }
+    }
+}
+
+/// What an agent knows of a neighbour.
+#[derive(Clone, Debug, Default)]
+struct Neighbour {
+    /// Last sequence heard from it.
+    heard: u64,
+    /// It said something that was not answered yet.
+    owed: bool,
+    /// Last sequence of ours that it has heard.
+    has_heard: u64,
+    /// Nodes of ours that it has measurements to.
+    boundary: Vec<NodeId>,
+}
+
+/// The state of one agent.
+pub struct BlockAgent {
+    block: Block,
+    settings: BlockSettings,
+    /// `map_from_node` of own nodes that have found their place.
+    poses: BTreeMap<NodeId, Pose>,
+    /// And of neighbours' nodes, as last heard.
+    known: BTreeMap<NodeId, Pose>,
+    /// One per measurement of the block.
+    weights: Vec<f64>,
+    changes_of_weight: Vec<u32>,
+    neighbours: BTreeMap<BlockId, Neighbour>,
+    /// Rises with what others should hear.
+    sequence: u64,
+    /// Own poses under that sequence.
+    said: BTreeMap<NodeId, Pose>,
+    /// Share of the last move that the next step carries on with.
+    momentum: f64,
+    /// How the nodes moved in the last step.
+    moved: BTreeMap<NodeId, Tangent>,
+    /// Running mean of the distance to the block's own minimum, all nodes together.
+    usual_step: f64,
+    /// The least that it was since momentum was last cut.
+    least_step: f64,
+    most_momentum: f64,
+    /// How far the farthest were from it in the last step.
+    farthest_m: f64,
+    farthest_rad: f64,
+    /// The problem over what is placed and known at present.
+    local: Option<Local>,
+    /// Something was heard, or a descent is not finished.
+    busy: bool,
+    iterations: u64,
+}
+
+impl BlockAgent {
+    /// Begins. `start` gives the poses of the block's fixed nodes; all others find their place from there.
+    pub fn new(block: Block, start: impl Fn(NodeId) -> Pose, settings: BlockSettings) -> Self {
+        let mut neighbours: BTreeMap<BlockId, Neighbour> = BTreeMap::new();
+        for edge in &block.edges {
+            let (from, to) = (edge.constraint.from as NodeId, edge.constraint.to as NodeId);
+            for (own, other) in [(from, to), (to, from)] {
+                if let Some(id) = block.neighbours.get(&other) {
+                    neighbours.entry(*id).or_default().boundary.push(own);
+                }
+            }
+        }
+        for neighbour in neighbours.values_mut() {
+            neighbour.boundary.sort_unstable();
+            neighbour.boundary.dedup();
+        }
+        BlockAgent {
+            poses: block.fixed.iter().map(|node| (*node, start(*node))).collect(),
+            weights: block.edges.iter().map(|e| e.weight).collect(),
+            changes_of_weight: vec![0; block.edges.len()],
+            block,
+            settings,
+            known: BTreeMap::new(),
+            neighbours,
+            sequence: 0,
+            said: BTreeMap::new(),
+            momentum: 0.0,
+            moved: BTreeMap::new(),
+            usual_step: 0.0,
+            least_step: f64::INFINITY,
+            most_momentum: settings.most_momentum,
+            farthest_m: 0.0,
+            farthest_rad: 0.0,
+            local: None,
+            busy: true,
+            iterations: 0,
+        }
+    }
+
+    /// The block's number.
+    pub fn id(&self) -> BlockId {
+        self.block.id
+    }
+
+    /// `map_from_node` of the block's nodes that have found their place.
+    pub fn poses(&self) -> &BTreeMap<NodeId, Pose> {
+        &self.poses
+    }
+
+    /// Weights of the measurements that this block decides on, by their index in the whole problem: those within it,
+    /// and those to blocks of a larger number.
+    pub fn weights(&self) -> impl Iterator<Item = (u32, f64)> + '_ {
+        let own = self.block.edges.iter().zip(&self.weights).filter(|(e, _)| self.decides(&e.constraint));
+        own.map(|(e, w)| (e.index, *w))
+    }
+
+    /// Linear solves so far.
+    pub fn iterations(&self) -> u64 {
+        self.iterations
+    }
+
+    /// True if there is nothing to do and every neighbour has heard all there is to hear.
+    pub fn is_settled(&self) -> bool {
+        !self.busy && self.neighbours.values().all(|n| n.has_heard >= self.sequence && !n.owed)
+    }
+
+    fn decides(&self, c: &Constraint) -> bool {
+        let other = |node: usize| self.block.neighbours.get(&(node as NodeId)).copied();
+        other(c.from).or(other(c.to)).is_none_or(|other| self.block.id < other)
+    }
+
+    /// Takes what a neighbour says. What is older than what is known, and what names strangers, changes nothing.
+    pub fn receive(&mut self, message: &Boundary) {
+        let Some(neighbour) = self.neighbours.get_mut(&message.from) else { return };
+        neighbour.has_heard = neighbour.has_heard.max(message.heard.min(self.sequence));
+        neighbour.owed |= message.sequence > 0;
+        if message.sequence <= neighbour.heard {
+            return;
+        }
+        neighbour.heard = message.sequence;
+        for (node, pose) in &message.poses {
+            let sound = pose.translation.vector.iter().all(|x| x.is_finite())
+                && (pose.rotation.quaternion().norm() - 1.0).abs() < 1e-6;
+            if sound && self.block.neighbours.get(node) == Some(&message.from) {
+                self.busy = true;
+                if self.known.insert(*node, *pose).is_none() {
+                    self.local = None;
+                }
+            }
+        }
+        for (index, weight) in &message.weights {
+            let found = self.block.edges.binary_search_by_key(index, |e| e.index);
+            let foreign = |k: &usize| !self.decides(&self.block.edges[*k].constraint);
+            if let Some(k) = found.ok().filter(foreign).filter(|_| (0.0..=1.0).contains(weight)) {
+                self.busy |= self.weights[k] != *weight;
+                self.weights[k] = *weight;
+            }
+        }
+    }
+
+    /// Descends once if there is news, and says where the boundary is to every neighbour that may not know.
+    pub fn step(&mut self) -> Result<Vec<(BlockId, Boundary)>, SolveError> {
+        if self.busy {
+            self.busy = false;
+            self.place()?;
+            self.descend()?;
+            let changed = self.reweigh();
+            if changed || self.has_moved() {
+                self.sequence += 1;
+                self.said.clone_from(&self.poses);
+            }
+        }
+        let mut out = Vec::new();
+        let decided = |e: &super::BlockEdge| e.doubted && self.decides(&e.constraint);
+        for (id, neighbour) in &self.neighbours {
+            let mut message = Boundary {
+                from: self.block.id,
+                sequence: 0,
+                heard: neighbour.heard,
+                poses: Vec::new(),
+                weights: Vec::new(),
+            };
+            if neighbour.has_heard < self.sequence {
+                message.sequence = self.sequence;
+                let placed = |node: &NodeId| Some((*node, *self.poses.get(node)?));
+                message.poses = neighbour.boundary.iter().filter_map(placed).collect();
+                let leads_there = |e: &super::BlockEdge| {
+                    [e.constraint.from, e.constraint.to]
+                        .iter()
+                        .any(|n| self.block.neighbours.get(&(*n as NodeId)) == Some(id))
+                };
+                let edges = self.block.edges.iter().zip(&self.weights);
+                let told = edges.filter(|(e, _)| decided(e) && leads_there(e));
+                message.weights = told.map(|(e, w)| (e.index, *w)).collect();
+            }
+            if neighbour.owed || message.sequence > 0 {
+                out.push((*id, message));
+            }
+        }
+        self.neighbours.values_mut().for_each(|n| n.owed = false);
+        Ok(out)
+    }
+
+    /// Sets up the problem over what is known, and gives nodes that can be reached for the first time a place.
+    fn place(&mut self) -> Result<(), SolveError> {
+        if self.local.is_none() {
+            self.local = Local::new(&self.block, &self.known, &self.weights)?;
+            if let Some(local) = &self.local {
+                let placed = self.poses.len();
+                local.place(&mut self.poses, &self.known, &self.weights)?;
+                if self.poses.len() > placed {
+                    self.momentum = 0.0;
+                    self.moved.clear();
+                    self.usual_step = 0.0;
+                    self.least_step = f64::INFINITY;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Moves the block's nodes to the minimum that they have while all others stay, and on in the direction of the last
+    /// move (heavy ball). Where the minimum lies against that direction the momentum is lost.
+    fn descend(&mut self) -> Result<(), SolveError> {
+        let Some(local) = &mut self.local else { return Ok(()) };
+        let settings = SolverSettings {
+            max_iterations: self.settings.iterations_per_step,
+            relative_decrease: 1e-8,
+            ..SolverSettings::default()
+        };
+        let (target, solved) = local.solve(&self.poses, &self.known, &self.weights, &settings)?;
+        self.iterations += u64::from(solved.iterations);
+        // What is not at its minimum yet goes on without news.
+        self.busy |= !solved.converged;
+        let to_minimum =
+            |(node, goal): (&NodeId, &Pose)| Some((*node, se3::log(&self.poses.get(node)?.inv_mul(goal))));
+        let steps: BTreeMap<NodeId, Tangent> = target.iter().filter_map(to_minimum).collect();
+        let scale_m = local.rotation_scale_m();
+        let dot = |a: &Tangent, b: &Tangent| {
+            let turn = a.fixed_rows::<3>(3).dot(&b.fixed_rows::<3>(3));
+            a.fixed_rows::<3>(0).dot(&b.fixed_rows::<3>(0)) + scale_m * scale_m * turn
+        };
+        let length = steps.values().map(|step| dot(step, step)).sum::<f64>().sqrt();
+        self.usual_step = if self.usual_step > 0.0 { 0.8 * self.usual_step + 0.2 * length } else { length };
+        self.least_step = self.least_step.min(self.usual_step);
+        // Swinging around the minimum is what momentum does; swinging farther and farther is too much of it, as stale
+        // news makes it. In the end this is plain descent.
+        if self.usual_step > 3.0 * self.least_step {
+            self.most_momentum *= 0.7;
+            self.momentum = 0.0;
+            self.moved.clear();
+            self.least_step = self.usual_step;
+        }
+        self.momentum = (self.momentum + 0.1).min(self.most_momentum);
+        (self.farthest_m, self.farthest_rad) = (0.0, 0.0);
+        for (node, step) in steps {
+            let Some(pose) = self.poses.get_mut(&node) else { continue };
+            self.farthest_m = self.farthest_m.max(step.fixed_rows::<3>(0).norm());
+            self.farthest_rad = self.farthest_rad.max(step.fixed_rows::<3>(3).norm());
+            let carried = self.moved.get(&node).map_or_else(Tangent::zeros, |moved| moved * self.momentum);
+            let step = step + carried;
+            *pose *= se3::exp(&step);
+            pose.rotation.renormalize();
+            self.moved.insert(node, step);
+        }
+        Ok(())
+    }
+
+    fn has_moved(&self) -> bool {
+        self.poses.iter().any(|(node, pose)| match self.said.get(node) {
+            Some(said) => {
+                let (m, rad) = se3::distance(pose, said);
+                m > self.settings.still_m || rad > self.settings.still_rad
+            }
+            None => true,
+        })
+    }
+
+    /// Once the block is nearly still, doubted measurements count if they fit. True if a weight has changed.
+    fn reweigh(&mut self) -> bool {
+        let settled = self.farthest_m < 1e3 * self.settings.still_m
+            && self.farthest_rad < 1e3 * self.settings.still_rad;
+        let Some(local) = self.local.as_ref().filter(|_| settled) else { return false };
+        let mut next = self.weights.clone();
+        for (k, edge) in self.block.edges.iter().enumerate() {
+            let c = &edge.constraint;
+            let pose = |node: usize| {
+                let node = node as NodeId;
+                self.poses.get(&node).or_else(|| self.known.get(&node)).copied()
+            };
+            let (Some(from), Some(to)) = (pose(c.from), pose(c.to)) else { continue };
+            let frozen = self.changes_of_weight[k] >= self.settings.most_changes_of_weight;
+            if !edge.doubted || frozen || !self.decides(c) {
+                continue;
+            }
+            let error = crate::residual::residual(&from, &to, &c.from_from_to);
+            let squared = crate::residual::squared_mahalanobis(&error, &c.information);
+            next[k] = final_weight(Kernel::TruncatedLeastSquares, self.settings.squared_error_6dof, squared);
+        }
+        // Never let go of the last measurement that holds a node.
+        if next == self.weights || !local.holds(&next) {
+            return false;
+        }
+        for (k, (new, old)) in next.iter().zip(&self.weights).enumerate() {
+            self.changes_of_weight[k] += u32::from(new != old);
+        }
+        self.weights = next;
+        self.busy = true;
+        true
+    }
+}
