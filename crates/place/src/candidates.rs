@@ -293,7 +293,11 @@ mod tests {
         known.insert(id("c", 0), 0, at(2, 0.0));
         let found = known.of(&id("c", 0));
         let lone = found.iter().find(|c| c.a == id("a", 2)).unwrap();
-        assert!((lone.window_similarity - 0.5 * (1.0 / 3.0 + 1.0)).abs() < 1e-6, "{}", lone.window_similarity);
+        assert!(
+            (lone.window_similarity - 0.5 * (1.0 / 3.0 + 1.0)).abs() < 1e-6,
+            "{}",
+            lone.window_similarity
+        );
     }
 
     #[test]

@@ -202,7 +202,10 @@ mod tests {
         let (a, samples) = of(&once);
         let covariance = a.try_inverse().unwrap();
         for i in 0..3 {
-            assert!(covariance[(i, i)].sqrt() >= settings.floor_m && covariance[(i, i)].sqrt() < 0.02, "{covariance}");
+            assert!(
+                covariance[(i, i)].sqrt() >= settings.floor_m && covariance[(i, i)].sqrt() < 0.02,
+                "{covariance}"
+            );
             assert!(covariance[(i + 3, i + 3)].sqrt() >= settings.floor_rad);
         }
         let tenfold: Vec<Residual> = (0..10).flat_map(|_| once.clone()).collect();

@@ -9,7 +9,8 @@ use coma_registration::{Outcome, Prepared, Settings, Side, View, align_prepared}
 /// average if it is right.
 fn squared_errors(noise: Option<SensorNoise>) -> Vec<f64> {
     const FRAMES: usize = 200;
-    let world = World::new(WorldSettings { agents: 2, frames: FRAMES, noise, ..WorldSettings::default() }).unwrap();
+    let world =
+        World::new(WorldSettings { agents: 2, frames: FRAMES, noise, ..WorldSettings::default() }).unwrap();
     let settings = Settings::default();
     let mut views: Vec<(Prepared, Pose)> = Vec::new();
     for agent in 0..2 {

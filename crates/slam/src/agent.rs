@@ -9,8 +9,8 @@
 //! whatever the network does.
 
 use crate::log::{OdometryEdge, SubmapOpened};
-use crate::odometry;
 use crate::mapping::submap::{ActiveSubmap, MappedFrame, MappingSettings};
+use crate::odometry;
 use crate::tracking::align::Brightness;
 use crate::tracking::view::TrackingView;
 use crate::tracking::{self, Reason, State, Tracked, TrackingSettings, model::Model};

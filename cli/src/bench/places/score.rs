@@ -116,10 +116,12 @@ impl Known<'_> {
 
     /// As candidates are verified: each frame of a window with its best counterpart in the other, on average.
     fn window_similarity(&self, i: usize, j: usize) -> f32 {
-        let near = |k: usize| (0..self.ids.len()).filter(move |l| self.ids[*l].abs_diff(self.ids[k]) <= self.window);
+        let near =
+            |k: usize| (0..self.ids.len()).filter(move |l| self.ids[*l].abs_diff(self.ids[k]) <= self.window);
         let far = |a: usize, b: usize| self.ids[a].abs_diff(self.ids[b]) > self.gap;
         let mean = |from: usize, into: usize| {
-            let best = |a: usize| near(into).filter(|b| far(a, *b)).map(|b| self.similarity[a][b]).reduce(f32::max);
+            let best =
+                |a: usize| near(into).filter(|b| far(a, *b)).map(|b| self.similarity[a][b]).reduce(f32::max);
             let all: Vec<f32> = near(from).filter_map(best).collect();
             all.iter().sum::<f32>() / all.len() as f32
         };
