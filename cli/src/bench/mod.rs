@@ -8,6 +8,7 @@ pub mod graph;
 pub mod index;
 mod overlap;
 pub mod places;
+pub mod raster;
 pub mod registration;
 pub mod robust;
 pub mod sets;
@@ -20,6 +21,7 @@ use clap::Subcommand;
 pub enum Bench {
     /// One agent alone: accuracy and time per frame.
     Tracking(tracking::Arguments),
+    Raster(raster::Arguments),
     Registration(registration::Arguments),
     Places(places::Arguments),
     Index(index::Arguments),
@@ -32,6 +34,7 @@ pub enum Bench {
 pub fn run(bench: &Bench) -> anyhow::Result<()> {
     match bench {
         Bench::Tracking(arguments) => tracking::run(arguments),
+        Bench::Raster(arguments) => raster::run(arguments),
         Bench::Registration(arguments) => registration::run(arguments),
         Bench::Places(arguments) => places::run(arguments),
         Bench::Index(arguments) => index::run(arguments),

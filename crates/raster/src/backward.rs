@@ -5,8 +5,7 @@
 //! the result does not depend on the number of threads.
 
 use crate::blend::TileSurfels;
-use crate::forward::RenderState;
-use crate::gradient::{Sums, TileGradient, TileLoss};
+use crate::gradient::{RUN, Run, Sums, TileGradient, TileLoss};
 use crate::parameters::to_parameters;
 use crate::{RenderSettings, Rendering, SubmapView};
 use coma_frame::Image;
@@ -62,49 +61,37 @@ pub fn backward(
 ) -> Gradients {
     let state = &rendering.state;
     let scratch = || (TileSurfels::default(), TileLoss::empty());
-    let sums: Vec<Vec<Sums>> = state
+    let sums: Vec<Vec<Run>> = state
         .blended
         .par_iter()
         .enumerate()
         .map_init(scratch, |(surfels, loss), (row, blended)| {
-            let mut out = Vec::with_capacity(blended.entries.len());
+            let mut out = Vec::new();
+            out.resize_with(state.projected.len().div_ceil(RUN), Run::default);
             for column in 0..state.grid.columns {
                 let entries = blended.tile(column);
                 if entries.is_empty() {
                     continue;
                 }
                 let origin = state.grid.origin(row * state.grid.columns + column);
-                surfels.gather_blended(entries, &state.order, &state.projected);
+                surfels.gather_blended(entries, &state.projected);
                 loss.read(rendering, pixels, origin);
-                let (origin, out) = (origin.map(|v| v as f32), &mut out);
+                let (origin, out) = (origin.map(|v| v as f32), &mut out[..]);
                 state.arch.dispatch(TileGradient { surfels, origin, camera, settings, loss, out });
             }
             out
         })
         .collect();
-    to_parameters(submaps, camera, state, &totals(state, &sums))
+    to_parameters(submaps, camera, &state.projected, &totals(state.projected.len(), &sums))
 }
 
-/// Surfels that one task adds up, at least.
-const CHUNK: usize = 8192;
-
-/// Sums by rank; `sums` are those of the rows of tiles. A task adds up a run of ranks, which is a run of every
-/// tile's entries, tile after tile.
-fn totals(state: &RenderState, sums: &[Vec<Sums>]) -> Vec<Sums> {
-    let mut totals: Vec<Sums> = bytemuck::zeroed_vec(state.order.len());
-    let chunk = CHUNK.max(totals.len().div_ceil(16));
-    totals.par_chunks_mut(chunk).enumerate().for_each(|(i, totals)| {
-        let first = (i * chunk) as u32;
-        let end = first + totals.len() as u32;
-        for (blended, sums) in state.blended.iter().zip(sums) {
-            for column in 0..state.grid.columns {
-                let entries = blended.tile(column);
-                let sums = &sums[blended.starts[column] as usize..];
-                let from = entries.partition_point(|e| e.rank < first);
-                let run = entries[from..].iter().zip(&sums[from..]);
-                for (entry, sums) in run.take_while(|(entry, _)| entry.rank < end) {
-                    totals[(entry.rank - first) as usize].add(sums);
-                }
+/// Sums by slot; `sums` are those of the rows of tiles.
+fn totals(slots: usize, sums: &[Vec<Run>]) -> Vec<Sums> {
+    let mut totals: Vec<Sums> = bytemuck::zeroed_vec(slots);
+    totals.par_chunks_mut(RUN).enumerate().for_each(|(run, totals)| {
+        for row in sums {
+            for (slot, sums) in row[run].slots.iter().zip(&row[run].sums) {
+                totals[*slot as usize % RUN].add(sums);
             }
         }
     });

@@ -56,11 +56,11 @@ pub(crate) struct TileSurfels {
 }
 
 impl TileSurfels {
-    /// Takes a tile's entries; `slots` is by rank, `projected` by slot.
-    pub fn gather(&mut self, entries: impl Iterator<Item = Entry>, slots: &[u32], projected: &[Projected]) {
+    /// Takes a tile's entries; `projected` is by slot.
+    pub fn gather(&mut self, entries: impl Iterator<Item = Entry>, projected: &[Projected]) {
         self.entries.clear();
         self.entries.extend(entries);
-        self.fetch(slots, projected);
+        self.fetch(projected);
         self.blocks.iter_mut().for_each(Vec::clear);
         for (index, entry) in self.entries.iter_mut().enumerate() {
             let mut left = std::mem::take(&mut entry.blocks);
@@ -72,17 +72,16 @@ impl TileSurfels {
     }
 
     /// Takes what the blend left.
-    pub fn gather_blended(&mut self, entries: &[Entry], slots: &[u32], projected: &[Projected]) {
+    pub fn gather_blended(&mut self, entries: &[Entry], projected: &[Projected]) {
         self.entries.clear();
         self.entries.extend_from_slice(entries);
-        self.fetch(slots, projected);
+        self.fetch(projected);
     }
 
     /// A loop of its own: its cache misses overlap, as they would not between the blend's computations.
-    fn fetch(&mut self, slots: &[u32], projected: &[Projected]) {
+    fn fetch(&mut self, projected: &[Projected]) {
         self.projected.clear();
-        self.projected
-            .extend(self.entries.iter().map(|entry| projected[slots[entry.rank as usize] as usize]));
+        self.projected.extend(self.entries.iter().map(|entry| projected[entry.slot as usize]));
     }
 }
 

@@ -1,15 +1,16 @@
 //! The forward pass: project, sort, tile, blend; tiles are blended and written in rows of tiles.
 
-use crate::blend::{Blend, TileImage, TileImages, TileSurfels};
-use crate::project::{Projected, project};
+use crate::bands::{Band, Bands};
+use crate::blend::{Blend, TileImages, TileSurfels};
+use crate::project::{Projected, Scene, project};
+use crate::reach::Reach;
 use crate::settings::{GrowthTest, ObservedTile, Outputs, RenderSettings};
 use crate::tiles::{Entry, Grid, Tiles};
-use crate::{BLOCK, LANES, Rendering, SubmapView, TILE, sort};
+use crate::{Rendering, SubmapView, sort};
 use coma_frame::Image;
 use coma_geometry::Intrinsics;
 use pulp::Arch;
 use rayon::prelude::*;
-use std::slice::ChunksMut;
 
 /// What the forward pass leaves to the backward pass.
 #[derive(Debug)]
@@ -18,8 +19,6 @@ pub(crate) struct RenderState {
     pub grid: Grid,
     /// By slot.
     pub projected: Vec<Projected>,
-    /// Slots from near to far.
-    pub order: Vec<u32>,
     /// What was blended, one for each row of tiles.
     pub blended: Vec<BlendedRow>,
 }
@@ -75,24 +74,79 @@ pub(crate) fn render_on(
     growth: Option<&GrowthTest<'_>>,
     outputs: Outputs,
 ) -> Rendering {
-    let grid = Grid::of(camera);
-    let scene = project(submaps, camera, settings);
-    let order = sort::by_upper_half(scene.keys);
-    let tiles = Tiles::build(arch, &order, &scene.reach, grid);
-    let mut out = empty(camera, growth.is_some(), outputs);
-    let mut bands = Bands::new(&mut out, camera);
-    let bands: Vec<Band<'_>> = (0..grid.rows).map(|_| bands.next()).collect();
-    let kernel = kernel(outputs, growth.is_some());
-    let blended: Vec<(BlendedRow, u64)> = bands
-        .into_par_iter()
-        .enumerate()
-        .map_init(Scratch::new, |scratch, (row, mut band)| {
+    let view = View { arch, camera, settings };
+    Projection::on(view, submaps).sort().tile().blend(growth, outputs)
+}
+
+#[derive(Clone, Copy)]
+struct View<'a> {
+    arch: Arch,
+    camera: &'a Intrinsics,
+    settings: &'a RenderSettings,
+}
+
+/// The first step of [`render`], for those who time each: surfels as the camera sees them.
+pub struct Projection<'a> {
+    view: View<'a>,
+    scene: Scene,
+}
+
+/// The second step: their order from near to far.
+pub struct Sorted<'a> {
+    view: View<'a>,
+    projected: Vec<Projected>,
+    reach: Vec<Reach>,
+    order: Vec<u32>,
+}
+
+/// The third step: which tiles and blocks they touch.
+pub struct Tiled<'a> {
+    view: View<'a>,
+    projected: Vec<Projected>,
+    tiles: Tiles,
+}
+
+impl<'a> Projection<'a> {
+    /// Projects.
+    pub fn of(submaps: &[SubmapView<'_>], camera: &'a Intrinsics, settings: &'a RenderSettings) -> Self {
+        Projection::on(View { arch: Arch::new(), camera, settings }, submaps)
+    }
+
+    fn on(view: View<'a>, submaps: &[SubmapView<'_>]) -> Self {
+        Projection { view, scene: project(submaps, view.camera, view.settings) }
+    }
+
+    /// Sorts.
+    pub fn sort(self) -> Sorted<'a> {
+        let Scene { projected, reach, keys } = self.scene;
+        Sorted { view: self.view, projected, reach, order: sort::by_upper_half(keys) }
+    }
+}
+
+impl<'a> Sorted<'a> {
+    /// Finds the tiles.
+    pub fn tile(self) -> Tiled<'a> {
+        let tiles = Tiles::build(self.view.arch, &self.order, &self.reach, Grid::of(self.view.camera));
+        Tiled { view: self.view, projected: self.projected, tiles }
+    }
+}
+
+impl Tiled<'_> {
+    /// Blends and writes the images.
+    pub fn blend(self, growth: Option<&GrowthTest<'_>>, outputs: Outputs) -> Rendering {
+        let Tiled { view: View { arch, camera, settings }, projected, tiles } = self;
+        let grid = Grid::of(camera);
+        let mut out = empty(camera, growth.is_some(), outputs);
+        let mut bands = Bands::new(&mut out, camera);
+        let bands: Vec<Band<'_>> = (0..grid.rows).map(|_| bands.next()).collect();
+        let kernel = kernel(outputs, growth.is_some());
+        let row = |scratch: &mut Scratch, (row, mut band): (usize, Band<'_>)| {
             let mut hits = 0;
             let mut blended = BlendedRow { starts: vec![0], entries: Vec::new() };
             for column in 0..grid.columns {
                 let tile = row * grid.columns + column;
                 let origin = grid.origin(tile);
-                scratch.surfels.gather(tiles.entries(tile), &order, &scene.projected);
+                scratch.surfels.gather(tiles.entries(tile), &projected);
                 if let Some(test) = growth {
                     scratch.observed.read(test, origin);
                 }
@@ -103,12 +157,14 @@ pub(crate) fn render_on(
                 blended.starts.push(blended.entries.len() as u32);
             }
             (blended, hits)
-        })
-        .collect();
-    out.hits = blended.iter().map(|(_, hits)| hits).sum();
-    let blended = blended.into_iter().map(|(row, _)| row).collect();
-    out.state = RenderState { arch, grid, projected: scene.projected, order, blended };
-    out
+        };
+        let rows: Vec<(BlendedRow, u64)> =
+            bands.into_par_iter().enumerate().map_init(Scratch::new, row).collect();
+        out.hits = rows.iter().map(|(_, hits)| hits).sum();
+        let blended = rows.into_iter().map(|(row, _)| row).collect();
+        out.state = RenderState { arch, grid, projected, blended };
+        out
+    }
 }
 
 fn empty(camera: &Intrinsics, growth: bool, outputs: Outputs) -> Rendering {
@@ -128,7 +184,6 @@ fn empty(camera: &Intrinsics, growth: bool, outputs: Outputs) -> Rendering {
             arch: Arch::Scalar,
             grid: Grid::default(),
             projected: Vec::new(),
-            order: Vec::new(),
             blended: Vec::new(),
         },
     }
@@ -173,97 +228,5 @@ fn kernel(outputs: Outputs, growth: bool) -> Kernel {
         (true, false, true) => run::<true, false, true>,
         (true, true, false) => run::<true, true, false>,
         (true, true, true) => run::<true, true, true>,
-    }
-}
-
-/// The images cut into rows of tiles.
-struct Bands<'a> {
-    color: ChunksMut<'a, [f32; 3]>,
-    depth: ChunksMut<'a, f32>,
-    median: ChunksMut<'a, f32>,
-    spread: ChunksMut<'a, f32>,
-    opacity: ChunksMut<'a, f32>,
-    normal: ChunksMut<'a, [f32; 3]>,
-    near: ChunksMut<'a, bool>,
-    width: usize,
-}
-
-/// One row of tiles; images that are not wanted are empty.
-struct Band<'a> {
-    color: &'a mut [[f32; 3]],
-    depth: &'a mut [f32],
-    median: &'a mut [f32],
-    spread: &'a mut [f32],
-    opacity: &'a mut [f32],
-    normal: &'a mut [[f32; 3]],
-    near: &'a mut [bool],
-    width: usize,
-}
-
-impl<'a> Bands<'a> {
-    fn new(out: &'a mut Rendering, camera: &Intrinsics) -> Self {
-        let width = camera.width as usize;
-        let size = TILE * width;
-        let near = out.near_surface.as_mut().map(|image| image.pixels_mut()).unwrap_or_default();
-        Bands {
-            color: out.color.pixels_mut().chunks_mut(size),
-            depth: out.depth_m.pixels_mut().chunks_mut(size),
-            median: out.median_depth_m.pixels_mut().chunks_mut(size),
-            spread: out.depth_spread_m.pixels_mut().chunks_mut(size),
-            opacity: out.opacity.pixels_mut().chunks_mut(size),
-            normal: out.normal.pixels_mut().chunks_mut(size),
-            near: near.chunks_mut(size),
-            width,
-        }
-    }
-
-    fn next(&mut self) -> Band<'a> {
-        Band {
-            color: self.color.next().unwrap_or_default(),
-            depth: self.depth.next().unwrap_or_default(),
-            median: self.median.next().unwrap_or_default(),
-            spread: self.spread.next().unwrap_or_default(),
-            opacity: self.opacity.next().unwrap_or_default(),
-            normal: self.normal.next().unwrap_or_default(),
-            near: self.near.next().unwrap_or_default(),
-            width: self.width,
-        }
-    }
-}
-
-impl Band<'_> {
-    /// Writes a tile whose first column is `x0`.
-    fn write(&mut self, tile: &TileImages, x0: usize) {
-        let place = Place { width: self.width, x0 };
-        place.write(self.depth, |i| tile.depth[i]);
-        place.write(self.median, |i| tile.median[i]);
-        place.write(self.spread, |i| tile.spread[i]);
-        place.write(self.opacity, |i| tile.opacity[i]);
-        let triple = |images: &[TileImage; 3], i: usize| [images[0][i], images[1][i], images[2][i]];
-        place.write(self.color, |i| triple(&tile.color, i));
-        place.write(self.normal, |i| triple(&tile.normal, i));
-        place.write(self.near, |i| tile.near[i] > 0.0);
-    }
-}
-
-/// Where a tile lies in its band.
-struct Place {
-    width: usize,
-    x0: usize,
-}
-
-impl Place {
-    /// Runs of a block's row: a tile's images are block by block, the band's row by row.
-    #[inline(always)]
-    fn write<T>(&self, band: &mut [T], value: impl Fn(usize) -> T) {
-        for (y, row) in band.chunks_mut(self.width).enumerate() {
-            let end = self.width.min(self.x0 + TILE);
-            for (column, run) in row[self.x0..end].chunks_mut(BLOCK).enumerate() {
-                let from = (y / BLOCK * BLOCK + column) * LANES + y % BLOCK * BLOCK;
-                for (x, out) in run.iter_mut().enumerate() {
-                    *out = value(from + x);
-                }
-            }
-        }
     }
 }

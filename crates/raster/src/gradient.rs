@@ -53,6 +53,11 @@ impl Sums {
         }
     }
 
+    /// True of a surfel that was nowhere blended.
+    pub fn is_zero(&self) -> bool {
+        self.0 == [0.0; 16]
+    }
+
     /// `p` is the surfel that was summed.
     pub fn named(&self, p: &Projected) -> Named {
         let s = &self.0;
@@ -141,8 +146,18 @@ pub(crate) struct TileGradient<'a> {
     pub settings: &'a RenderSettings,
     /// Used up.
     pub loss: &'a mut TileLoss,
-    /// One is added for each surfel.
-    pub out: &'a mut Vec<Sums>,
+    /// One sum is added for each surfel, to its slot's run.
+    pub out: &'a mut [Run],
+}
+
+/// Slots of a run: those whose totals one task adds up.
+pub(crate) const RUN: usize = 8192;
+
+/// Sums of a run of slots, in the order in which they were made.
+#[derive(Default)]
+pub(crate) struct Run {
+    pub slots: Vec<u32>,
+    pub sums: Vec<Sums>,
 }
 
 impl WithSimd for TileGradient<'_> {
@@ -168,7 +183,9 @@ impl WithSimd for TileGradient<'_> {
             for k in 0..SUMS {
                 sum[k] = sums[k].sum();
             }
-            self.out.push(Sums::of(&sum, p));
+            let run = &mut self.out[entry.slot as usize / RUN];
+            run.slots.push(entry.slot);
+            run.sums.push(Sums::of(&sum, p));
         }
     }
 }

@@ -7,6 +7,7 @@
 //! with the surfel's plane, and a screen-space low-pass for surfels that are seen edge-on or from afar.
 
 mod backward;
+mod bands;
 mod blend;
 mod forward;
 mod gradient;
@@ -22,7 +23,7 @@ mod sort;
 mod tiles;
 
 pub use backward::{Gradients, PixelGradients, SurfelGradients, backward};
-pub use forward::{render, render_only};
+pub use forward::{Projection, Sorted, Tiled, render, render_only};
 pub use settings::{GrowthTest, Outputs, RenderSettings};
 
 use coma_frame::Image;

@@ -68,6 +68,27 @@ pub fn render(surfels: &[OracleSurfel], camera: &Intrinsics, settings: &RenderSe
     out
 }
 
+/// Alpha, not yet cut off at its least, and depth of a surfel at a pixel.
+pub fn hit(s: &OracleSurfel, x: f64, y: f64, camera: &Intrinsics, settings: &RenderSettings) -> (f64, f64) {
+    let ray = camera.ray(x, y);
+    let normal: Vector3<f64> = s.axes.column(2).into();
+    // The ray t * ray meets the plane n . (p - c) = 0.
+    let t = normal.dot(&s.center) / normal.dot(&ray);
+    let hit = ray * t - s.center;
+    let (u, v) = (s.axes.column(0).dot(&hit) / s.scale[0], s.axes.column(1).dot(&hit) / s.scale[1]);
+    let on_plane = u * u + v * v;
+    let centre =
+        (camera.fx * s.center.x / s.center.z + camera.cx, camera.fy * s.center.y / s.center.z + camera.cy);
+    let low_pass = (settings.low_pass_px as f64).powi(2);
+    let on_screen = ((x - centre.0).powi(2) + (y - centre.1).powi(2)) / low_pass;
+    let (rho, depth) = if on_plane <= on_screen && t > settings.near_m as f64 {
+        (on_plane, t)
+    } else {
+        (on_screen, s.center.z)
+    };
+    ((s.opacity * (-0.5 * rho).exp()).min(ALPHA_MAX as f64), depth)
+}
+
 fn pixel(
     order: &[&OracleSurfel],
     x: f64,
@@ -75,28 +96,10 @@ fn pixel(
     camera: &Intrinsics,
     settings: &RenderSettings,
 ) -> OraclePixel {
-    let ray = camera.ray(x, y);
     let (mut passing, mut depth_sum) = (1.0f64, 0.0f64);
     let mut out = OraclePixel::default();
     for s in order {
-        let normal: Vector3<f64> = s.axes.column(2).into();
-        // The ray t * ray meets the plane n . (p - c) = 0.
-        let t = normal.dot(&s.center) / normal.dot(&ray);
-        let hit = ray * t - s.center;
-        let (u, v) = (s.axes.column(0).dot(&hit) / s.scale[0], s.axes.column(1).dot(&hit) / s.scale[1]);
-        let on_plane = u * u + v * v;
-        let centre = (
-            camera.fx * s.center.x / s.center.z + camera.cx,
-            camera.fy * s.center.y / s.center.z + camera.cy,
-        );
-        let low_pass = (settings.low_pass_px as f64).powi(2);
-        let on_screen = ((x - centre.0).powi(2) + (y - centre.1).powi(2)) / low_pass;
-        let (rho, depth) = if on_plane <= on_screen && t > settings.near_m as f64 {
-            (on_plane, t)
-        } else {
-            (on_screen, s.center.z)
-        };
-        let alpha = (s.opacity * (-0.5 * rho).exp()).min(ALPHA_MAX as f64);
+        let (alpha, depth) = hit(s, x, y, camera, settings);
         if alpha < settings.alpha_min as f64 {
             continue;
         }

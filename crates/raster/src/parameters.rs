@@ -2,7 +2,6 @@
 
 use crate::SubmapView;
 use crate::backward::{Gradients, SurfelGradients};
-use crate::forward::RenderState;
 use crate::gradient::{Named, Sums};
 use crate::project::{CameraFromSubmap, InCamera, Projected};
 use coma_geometry::{Intrinsics, Tangent};
@@ -12,19 +11,15 @@ use rayon::prelude::*;
 /// Surfels of one task.
 const CHUNK: usize = 2048;
 
-/// `totals` is by rank.
+/// `projected` and `totals` are by slot.
 pub(crate) fn to_parameters(
     submaps: &[SubmapView<'_>],
     camera: &Intrinsics,
-    state: &RenderState,
+    projected: &[Projected],
     totals: &[Sums],
 ) -> Gradients {
     let surfels = submaps.iter().map(|view| view.surfels.len()).sum::<usize>();
-    assert_eq!(surfels, state.projected.len(), "the submaps are those that were rendered");
-    let mut ranks = vec![HIDDEN; state.projected.len()];
-    for (rank, slot) in state.order.iter().enumerate() {
-        ranks[*slot as usize] = rank as u32;
-    }
+    assert_eq!(surfels, projected.len(), "the submaps are those that were rendered");
     let mut pose = Tangent::zeros();
     let mut first_slot = 0;
     let mut out = Vec::with_capacity(submaps.len());
@@ -42,9 +37,8 @@ pub(crate) fn to_parameters(
                 .cast::<f32>()
                 .to_rotation_matrix()
                 .matrix(),
-            projected: &state.projected[slots.clone()],
-            ranks: &ranks[slots],
-            totals,
+            projected: &projected[slots.clone()],
+            totals: &totals[slots],
         };
         let (gradients, turn) = part.gradients();
         pose += turn;
@@ -53,23 +47,19 @@ pub(crate) fn to_parameters(
     Gradients { submaps: out, pose }
 }
 
-/// The rank of a surfel that is not visible.
-const HIDDEN: u32 = u32::MAX;
-
 struct Submap<'a> {
     view: &'a SubmapView<'a>,
     camera: &'a Intrinsics,
     camera_from_submap: CameraFromSubmap,
     submap_from_camera: Matrix3<f32>,
     projected: &'a [Projected],
-    ranks: &'a [u32],
     totals: &'a [Sums],
 }
 
 impl Submap<'_> {
     /// Of the surfels, and their share of the pose's: chunks are added up in their order.
     fn gradients(&self) -> (SurfelGradients, Tangent) {
-        let n = self.ranks.len();
+        let n = self.projected.len();
         let mut out = SurfelGradients {
             center_m: vec![[0.0; 3]; n],
             rotation: vec![[0.0; 3]; n],
@@ -88,14 +78,13 @@ impl Submap<'_> {
             .enumerate()
             .map(|(chunk, (center, rotation, scale, opacity, color))| {
                 let mut pose = Tangent::zeros();
-                let ranks = &self.ranks[chunk * CHUNK..];
-                // Fetched in a loop of its own: its cache misses overlap.
-                let fetch = |rank: &u32| self.totals.get(*rank as usize).copied();
-                let totals: Vec<Option<Sums>> = ranks[..center.len()].iter().map(fetch).collect();
-                for (i, sums) in totals.iter().enumerate() {
-                    let Some(sums) = sums else { continue };
-                    let sums = sums.named(&self.projected[chunk * CHUNK + i]);
-                    let one = self.one(chunk * CHUNK + i, &sums);
+                for i in 0..center.len() {
+                    let index = chunk * CHUNK + i;
+                    if self.totals[index].is_zero() {
+                        continue;
+                    }
+                    let sums = self.totals[index].named(&self.projected[index]);
+                    let one = self.one(index, &sums);
                     center[i] = (self.submap_from_camera * one.center).into();
                     rotation[i] = one.rotation;
                     scale[i] = one.scale;

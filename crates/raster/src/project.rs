@@ -75,8 +75,12 @@ impl InCamera {
 const CHUNK: usize = 2048;
 
 /// Projects every surfel of every submap.
+///
+/// # Panics
+/// If there are more than a slot's 32 bits can name.
 pub(crate) fn project(submaps: &[SubmapView<'_>], camera: &Intrinsics, settings: &RenderSettings) -> Scene {
     let total = submaps.iter().map(|view| view.surfels.len()).sum::<usize>();
+    assert!(u32::try_from(total).is_ok(), "{total} surfels are more than 2^32 - 1");
     let mut projected: Vec<Projected> = bytemuck::zeroed_vec(total);
     let mut reach: Vec<Reach> = bytemuck::zeroed_vec(total);
     let mut tasks = Vec::new();
@@ -133,5 +137,8 @@ fn project_one(
         (e * k - n * e.dot(&s.center)) / s.scale[column]
     };
     let (a, b) = (axis(0), axis(1));
+    if !a.iter().chain(&b).all(|v| v.is_finite()) {
+        return None;
+    }
     Some((Projected { a: a.into(), b: b.into(), n: n.into(), k, pixel, z, opacity, color }, reach))
 }

@@ -145,3 +145,75 @@ pub(crate) const fn per_block(divisor: u32, unit: u32) -> [f32; 16] {
     }
     out
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::project::project;
+    use crate::{ALPHA_MAX, SubmapView, TILE, oracle, scene};
+    use coma_geometry::Pose;
+    use coma_surfel::SurfelCloud;
+    use pulp::WithSimd;
+
+    struct Blocks<'a>(&'a Reach, [f32; 2]);
+
+    impl WithSimd for Blocks<'_> {
+        type Output = u16;
+        #[inline(always)]
+        fn with_simd<S: Simd>(self, simd: S) -> u16 {
+            self.0.blocks(simd, self.1)
+        }
+    }
+
+    /// Blocks of the whole picture that hold a pixel at which alpha reaches its least, by the definition in
+    /// double precision, and blocks that the reach names.
+    fn compare(cloud: &SurfelCloud, shrink: f32) -> (usize, usize, usize) {
+        let camera = scene::camera(96, 64);
+        let settings = RenderSettings::default();
+        let views = [SubmapView { surfels: cloud, camera_from_submap: Pose::identity() }];
+        let mut found = project(&views, &camera, &settings);
+        let (mut missed, mut needed, mut named) = (0, 0, 0);
+        for (slot, surfel) in oracle::in_camera(&views).iter().enumerate() {
+            let reach = &mut found.reach[slot];
+            let visible = found.projected[slot].z > 0.0;
+            reach.conic = reach.conic.map(|v| v / shrink);
+            reach.radius2 *= shrink;
+            for tile in 0..6 * 4 {
+                let (x0, y0) = (tile % 6 * TILE, tile / 6 * TILE);
+                let [left, up, right, down] = reach.tiles();
+                let in_box = (left..=right).contains(&(tile % 6)) && (up..=down).contains(&(tile / 6));
+                let bits = if visible && in_box {
+                    pulp::Arch::new().dispatch(Blocks(reach, [x0 as f32, y0 as f32]))
+                } else {
+                    0
+                };
+                for block in 0..16 {
+                    let touched = (0..16).any(|i| {
+                        let x = x0 + block % 4 * BLOCK + i % 4;
+                        let y = y0 + block / 4 * BLOCK + i / 4;
+                        let (alpha, _) = oracle::hit(surfel, x as f64, y as f64, &camera, &settings);
+                        // Rounding may take the last thousandth.
+                        alpha >= settings.alpha_min as f64 * 1.001 && alpha <= ALPHA_MAX as f64
+                    });
+                    needed += touched as usize;
+                    named += (bits >> block & 1) as usize;
+                    missed += (touched && bits >> block & 1 == 0) as usize;
+                }
+            }
+        }
+        (missed, needed, named)
+    }
+
+    #[test]
+    fn no_hit_lies_outside_and_little_else_lies_inside() {
+        let camera = scene::camera(96, 64);
+        for (hits, limit) in [(3.0, 1.35), (200.0, 1.15), (2000.0, 1.1)] {
+            let cloud = scene::scattered(&camera, 150, hits, 7);
+            let (missed, needed, named) = compare(&cloud, 1.0);
+            assert_eq!(missed, 0, "of {needed}");
+            assert!((named as f64) < limit * needed as f64, "{named} blocks for {needed}");
+            let (missed, _, _) = compare(&cloud, 0.5);
+            assert!(missed > 0, "the harness sees regions that are too small");
+        }
+    }
+}

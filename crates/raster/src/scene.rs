@@ -27,7 +27,7 @@ pub fn scattered(camera: &Intrinsics, count: usize, hits: f32, seed: u64) -> Sur
     let mut random = Random(seed);
     // A disc of standard deviation s covers 2 pi s^2 ln(o / alpha_min) pixels, less where it is inclined; the
     // factor makes up for that, for the low-pass and for pixels that are done.
-    let area_px = 1.05 * hits * camera.pixels() as f32 / count.max(1) as f32;
+    let area_px = 0.87 * hits * camera.pixels() as f32 / count.max(1) as f32;
     let spread_px = (area_px / (2.0 * std::f32::consts::PI * 4.7)).sqrt();
     (0..count)
         .map(|_| {

@@ -5,6 +5,9 @@ use coma_surfel::Surfel;
 use nalgebra::{UnitQuaternion, Vector3};
 use oracle::OraclePixel;
 
+mod alike;
+mod poison;
+
 const CAMERA: Intrinsics = Intrinsics { width: 44, height: 36, fx: 40.0, fy: 42.0, cx: 21.5, cy: 17.0 };
 
 /// Numbers in 0..1 from a seed (a linear congruential generator).
@@ -216,46 +219,6 @@ fn the_gradient_of_the_camera_s_pose_agrees_with_differences() {
 }
 
 #[test]
-fn poisoned_surfels_are_left_out_and_spoil_nothing() {
-    let clean = surfels(1, 60);
-    let mut poisoned = clean.clone();
-    let good = clean.get(0);
-    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-        poisoned.push(Surfel { center_m: [bad, 0.0, 2.0], ..good });
-        poisoned.push(Surfel { rotation_wxyz: [bad, 0.0, 0.0, 0.0], ..good });
-        poisoned.push(Surfel { scale_m: [bad, 0.1], ..good });
-        poisoned.push(Surfel { opacity: bad, ..good });
-        poisoned.push(Surfel { color: [bad, 0.0, 0.0], ..good });
-    }
-    poisoned.push(Surfel { scale_m: [0.0, 0.1], ..good });
-    poisoned.push(Surfel { rotation_wxyz: [0.0; 4], ..good });
-    poisoned.push(Surfel { center_m: [0.0, 0.0, -1.0], ..good });
-    let image = |surfels: &SurfelCloud| {
-        let views = [SubmapView { surfels, camera_from_submap: Pose::identity() }];
-        let rendering = render(&views, &CAMERA, &RenderSettings::default(), None);
-        let gradients = backward(&views, &CAMERA, &RenderSettings::default(), &rendering, &pixel_gradients());
-        assert!(gradients.pose.iter().all(|v| v.is_finite()));
-        rendering.color
-    };
-    assert_eq!(image(&clean), image(&poisoned));
-}
-
-#[test]
-fn the_same_bits_come_from_one_thread_and_from_two() {
-    let cloud = surfels(1, 200);
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: pose() }];
-    let run = |threads| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| {
-            let rendering = render(&views, &CAMERA, &RenderSettings::default(), None);
-            let g = backward(&views, &CAMERA, &RenderSettings::default(), &rendering, &pixel_gradients());
-            (rendering.color, rendering.depth_m, g.pose, g.submaps[0].center_m.clone())
-        })
-    };
-    assert_eq!(run(1), run(2));
-}
-
-#[test]
 fn growth_sees_a_surfel_only_near_the_observed_depth() {
     let q = [1.0, 0.0, 0.0, 0.0];
     let wall = Surfel {
@@ -298,4 +261,31 @@ fn depth_along_a_tilted_surfel_is_that_of_the_ray_s_hit() {
     assert!((rendering.depth_m[(28, 17)] - truth).abs() < 1e-4);
     assert!((rendering.median_depth_m[(28, 17)] - truth).abs() < 1e-4);
     assert!(rendering.normal[(28, 17)][2] < 0.0, "it faces the camera");
+}
+
+#[test]
+fn the_comparison_of_gradients_sees_5_percent() {
+    let wrong = std::panic::catch_unwind(|| assert_close("scale", 105.0, 100.0, 30.0));
+    assert!(wrong.is_err());
+    assert_close("scale", 100.5, 100.0, 30.0);
+}
+
+#[test]
+fn a_hidden_surfel_near_the_observed_depth_is_known() {
+    let q = [1.0, 0.0, 0.0, 0.0];
+    let wall = |z: f32| Surfel {
+        center_m: [0.0, 0.0, z],
+        rotation_wxyz: q,
+        scale_m: [0.5; 2],
+        opacity: 0.99,
+        color: [0.5; 3],
+    };
+    let cloud: SurfelCloud = [1.0, 1.1, 1.2, 1.3, 2.0].map(wall).into_iter().collect();
+    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+    let depth = Image::filled(44, 36, 2.0f32);
+    let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.002 };
+    let test = GrowthTest { observed_depth_m: &depth, noise, sigma_factor: 3.0, relative: 0.01 };
+    let rendering = render(&views, &CAMERA, &RenderSettings::default(), Some(&test));
+    assert!(rendering.depth_m[(21, 17)] < 1.1, "nothing of the last one is seen");
+    assert!(rendering.near_surface.unwrap()[(21, 17)]);
 }

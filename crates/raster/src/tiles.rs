@@ -9,8 +9,7 @@ use rayon::prelude::*;
 /// A surfel in a tile.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Entry {
-    /// Its place from near to far.
-    pub rank: u32,
+    pub slot: u32,
     /// The blocks of the tile that it touches, one bit each.
     pub blocks: u16,
 }
@@ -43,14 +42,14 @@ impl Grid {
 /// Surfels that one task sorts into tiles.
 const CHUNK: usize = 4096;
 
-/// Entries of a run of ranks, tile by tile.
+/// Entries of a run of surfels from near to far, tile by tile.
 struct Run {
     /// Entries of tile `t` are `entries[starts[t]..starts[t + 1]]`.
     starts: Vec<u32>,
     entries: Vec<Entry>,
 }
 
-/// The entries of every tile, from near to far, as runs of ranks.
+/// The entries of every tile, from near to far, as runs.
 pub(crate) struct Tiles {
     runs: Vec<Run>,
 }
@@ -58,8 +57,8 @@ pub(crate) struct Tiles {
 impl Tiles {
     /// `order` names the slots of the surfels from near to far.
     pub fn build(arch: Arch, order: &[u32], reach: &[Reach], grid: Grid) -> Self {
-        let run = |(chunk, slots)| arch.dispatch(Fill { slots, first_rank: chunk * CHUNK, reach, grid });
-        Tiles { runs: order.par_chunks(CHUNK).enumerate().map(run).collect() }
+        let run = |slots| arch.dispatch(Fill { slots, reach, grid });
+        Tiles { runs: order.par_chunks(CHUNK).map(run).collect() }
     }
 
     pub fn entries(&self, tile: usize) -> impl Iterator<Item = Entry> {
@@ -73,7 +72,6 @@ impl Tiles {
 /// One run: finds the entries surfel by surfel, then sorts them by tile (counting first).
 struct Fill<'a> {
     slots: &'a [u32],
-    first_rank: usize,
     reach: &'a [Reach],
     grid: Grid,
 }
@@ -87,7 +85,7 @@ impl WithSimd for Fill<'_> {
         let mut starts = vec![0u32; self.grid.count() + 1];
         // Fetched in a loop of its own: its cache misses overlap.
         let reach: Vec<Reach> = self.slots.iter().map(|slot| self.reach[*slot as usize]).collect();
-        for (i, reach) in reach.iter().enumerate() {
+        for (slot, reach) in self.slots.iter().zip(&reach) {
             let [x0, y0, x1, y1] = reach.tiles();
             for y in y0..=y1 {
                 for x in x0..=x1 {
@@ -95,7 +93,7 @@ impl WithSimd for Fill<'_> {
                     if blocks != 0 {
                         let tile = y * self.grid.columns + x;
                         starts[tile + 1] += 1;
-                        found.push((tile as u32, Entry { rank: (self.first_rank + i) as u32, blocks }));
+                        found.push((tile as u32, Entry { slot: *slot, blocks }));
                     }
                 }
             }
@@ -104,7 +102,7 @@ impl WithSimd for Fill<'_> {
             starts[tile + 1] += starts[tile];
         }
         let mut next = starts.clone();
-        let mut entries = vec![Entry { rank: 0, blocks: 0 }; found.len()];
+        let mut entries = vec![Entry { slot: 0, blocks: 0 }; found.len()];
         for (tile, entry) in found {
             let place = &mut next[tile as usize];
             entries[*place as usize] = entry;
