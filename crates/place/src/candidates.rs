@@ -3,10 +3,11 @@
 
 use crate::descriptor::{Descriptor, Space, similarity};
 use crate::encoder::Thresholds;
-use crate::index::{ExactIndex, Index};
-use coma_geometry::SubmapId;
+use crate::index::{ExactIndex, Hit, Index};
+use coma_geometry::{AgentId, SubmapId};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 
 /// Settings of [`Candidates`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -42,12 +43,30 @@ pub struct Candidate {
     pub window_similarity: f32,
 }
 
+/// Which anchors may answer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Filter {
+    /// Those of these agents; none: of all.
+    pub agents: Option<BTreeSet<AgentId>>,
+    /// Those whose frame lies in here. Frames of different agents or lives have no common count.
+    pub frames: RangeInclusive<u64>,
+}
+
+impl Default for Filter {
+    /// All of them.
+    fn default() -> Self {
+        Filter { agents: None, frames: 0..=u64::MAX }
+    }
+}
+
+/// Anchors' descriptors, searched one way or another.
+type AnchorIndex = Box<dyn Index<SubmapId> + Send + Sync>;
+
 /// All anchors known, and the pairs already proposed.
-#[derive(Clone, Debug)]
 pub struct Candidates {
     settings: Settings,
     thresholds: BTreeMap<Space, Thresholds>,
-    index: ExactIndex<SubmapId>,
+    index: AnchorIndex,
     anchors: BTreeMap<SubmapId, Anchor>,
     tried: BTreeSet<(SubmapId, SubmapId)>,
 }
@@ -64,10 +83,19 @@ type Rated = BTreeMap<(SubmapId, SubmapId), (f32, Candidate)>;
 impl Candidates {
     /// Empty. Spaces without thresholds are stored but propose nothing.
     pub fn new(settings: Settings, thresholds: BTreeMap<Space, Thresholds>) -> Self {
+        Self::with_index(settings, thresholds, Box::new(ExactIndex::default()))
+    }
+
+    /// The same, searched by another index, which must be empty.
+    pub fn with_index(
+        settings: Settings,
+        thresholds: BTreeMap<Space, Thresholds>,
+        index: AnchorIndex,
+    ) -> Self {
         Candidates {
             settings,
             thresholds,
-            index: ExactIndex::default(),
+            index,
             anchors: BTreeMap::new(),
             tried: BTreeSet::new(),
         }
@@ -103,6 +131,15 @@ impl Candidates {
     /// The spaces of an anchor's descriptors; none for an unknown anchor.
     pub fn spaces(&self, id: &SubmapId) -> impl Iterator<Item = &Space> + '_ {
         self.anchors.get(id).into_iter().flat_map(|anchor| anchor.descriptors.keys())
+    }
+
+    /// The anchors most similar to a descriptor, of those that the filter lets pass; no threshold counts.
+    pub fn similar(&self, descriptor: &Descriptor, count: usize, filter: &Filter) -> Vec<Hit<SubmapId>> {
+        let admit = |id: &SubmapId| {
+            filter.agents.as_ref().is_none_or(|agents| agents.contains(&id.agent))
+                && self.anchors.get(id).is_some_and(|anchor| filter.frames.contains(&anchor.frame))
+        };
+        self.index.query(descriptor, count, &admit)
     }
 
     /// The new candidates that `id` and its window take part in (a new anchor also completes the windows of
@@ -357,5 +394,21 @@ mod tests {
         known.insert(id("a", 0), 0, at(0, 0.0));
         known.insert(id("b", 0), 0, at(0, 0.0));
         assert!(known.propose(&id("a", 0)).is_empty());
+    }
+
+    #[test]
+    fn similar_anchors_may_be_asked_for_by_agent_and_time() {
+        let mut known = empty();
+        for n in 0..4 {
+            known.insert(id("a", n), n as u64 * 20, at(0, 0.1 * n as f32));
+            known.insert(id("b", n), n as u64 * 20, at(0, 0.1 * n as f32));
+        }
+        let ask = |filter: &Filter| -> Vec<(String, u32)> {
+            let hits = known.similar(&at(0, 0.0), 10, filter);
+            hits.iter().map(|hit| (hit.key.agent.to_string(), hit.key.number)).collect()
+        };
+        assert_eq!(ask(&Filter::default()).len(), 8);
+        let only_b = Filter { agents: Some([AgentId::new("b").unwrap()].into()), frames: 20..=40 };
+        assert_eq!(ask(&only_b), [("b".to_owned(), 1), ("b".to_owned(), 2)]);
     }
 }

@@ -214,6 +214,7 @@ async fn indices_are_bounded_and_a_caller_whose_index_went_inserts_again() {
     }
     let status = client.insert(insert("y", vec![one(2), one(3)])).await.unwrap_err();
     assert_eq!(status.code(), Code::ResourceExhausted);
+    assert!(coma_wire::is_full(&status), "waiting would not help: {status:?}");
     assert!(status.message().contains("max_anchors_per_index"), "{status}");
     let held = client.insert(insert("y", vec![one(2)])).await.unwrap().into_inner().anchors_in_index;
     assert_eq!(held, 3, "what fits is taken later");
