@@ -92,13 +92,7 @@ impl Candidates {
         thresholds: BTreeMap<Space, Thresholds>,
         index: AnchorIndex,
     ) -> Self {
-        Candidates {
-            settings,
-            thresholds,
-            index,
-            anchors: BTreeMap::new(),
-            tried: BTreeSet::new(),
-        }
+        Candidates { settings, thresholds, index, anchors: BTreeMap::new(), tried: BTreeSet::new() }
     }
 
     /// Number of anchors.

@@ -10,11 +10,11 @@ use usearch::{IndexOptions, MetricKind, ScalarKind};
 
 /// Links of a node. Real descriptors come in walks, tight groups far from one another: with fewer links the groups
 /// fall apart. Here and below calibrated by `coma bench index`, 200,000 descriptors of 384 values.
-const LINKS: usize = 32;
+const LINKS: usize = 16;
 /// Nodes that are looked at when one is added.
-const ADDING: usize = 128;
+const ADDING: usize = 256;
 /// Nodes that are looked at by a query.
-const SEARCHING: usize = 96;
+const SEARCHING: usize = 512;
 /// Room that is made at once, descriptors.
 const ROOM: usize = 4096;
 

@@ -338,10 +338,14 @@ async fn settings_out_of_range_are_named() {
         Err(e) => e.to_string(),
     };
     let mut config = PlaceRecognitionConfig::default();
-    config.candidates.window = u32::MAX;
-    assert!(refused(config).await.starts_with("candidates.window = 4294967295"));
+    config.candidates.window_frames = 1001;
+    assert!(refused(config).await.starts_with("candidates.window_frames = 1001"));
     let config = PlaceRecognitionConfig { models: vec!["m".into(); 8], ..Default::default() };
     assert!(refused(config).await.starts_with("models = 8"));
+    if cfg!(not(feature = "usearch")) {
+        let config = PlaceRecognitionConfig { approximate: true, ..Default::default() };
+        assert!(refused(config).await.contains("without the feature `usearch`"));
+    }
 }
 
 #[tokio::test]

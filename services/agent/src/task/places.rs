@@ -174,7 +174,10 @@ fn set_aside(node: &Node, anchors: &[v1::Anchor], message: &str) -> anyhow::Resu
     let at = At::Root("anchors");
     let read = |a: &v1::Anchor| at.field("submap_id").required(a.submap_id.clone());
     let submaps = anchors.iter().map(read).collect::<Result<Vec<SubmapId>, _>>()?;
-    warn!(anchors = submaps.len(), message, "place recognition has no room: these places can't be recognised");
+    warn!(
+        anchors = submaps.len(),
+        message, "place recognition has no room: these places can't be recognised"
+    );
     let mut knowledge = node.lock();
     knowledge.closer.set_aside(submaps);
     knowledge.warn_once(format!("{message}: new places are no longer recognised"));
