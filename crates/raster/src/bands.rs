@@ -10,6 +10,7 @@ pub(crate) struct Bands<'a> {
     color: ChunksMut<'a, [f32; 3]>,
     depth: ChunksMut<'a, f32>,
     median: ChunksMut<'a, f32>,
+    surface: ChunksMut<'a, f32>,
     spread: ChunksMut<'a, f32>,
     opacity: ChunksMut<'a, f32>,
     normal: ChunksMut<'a, [f32; 3]>,
@@ -22,6 +23,7 @@ pub(crate) struct Band<'a> {
     color: &'a mut [[f32; 3]],
     depth: &'a mut [f32],
     median: &'a mut [f32],
+    surface: &'a mut [f32],
     spread: &'a mut [f32],
     opacity: &'a mut [f32],
     normal: &'a mut [[f32; 3]],
@@ -38,6 +40,7 @@ impl<'a> Bands<'a> {
             color: out.color.pixels_mut().chunks_mut(size),
             depth: out.depth_m.pixels_mut().chunks_mut(size),
             median: out.median_depth_m.pixels_mut().chunks_mut(size),
+            surface: out.surface_depth_m.pixels_mut().chunks_mut(size),
             spread: out.depth_spread_m.pixels_mut().chunks_mut(size),
             opacity: out.opacity.pixels_mut().chunks_mut(size),
             normal: out.normal.pixels_mut().chunks_mut(size),
@@ -51,6 +54,7 @@ impl<'a> Bands<'a> {
             color: self.color.next().unwrap_or_default(),
             depth: self.depth.next().unwrap_or_default(),
             median: self.median.next().unwrap_or_default(),
+            surface: self.surface.next().unwrap_or_default(),
             spread: self.spread.next().unwrap_or_default(),
             opacity: self.opacity.next().unwrap_or_default(),
             normal: self.normal.next().unwrap_or_default(),
@@ -66,6 +70,7 @@ impl Band<'_> {
         let place = Place { width: self.width, x0 };
         place.write(self.depth, |i| tile.depth[i]);
         place.write(self.median, |i| tile.median[i]);
+        place.write(self.surface, |i| tile.surface[i]);
         place.write(self.spread, |i| tile.spread[i]);
         place.write(self.opacity, |i| tile.opacity[i]);
         let triple = |images: &[TileImage; 3], i: usize| [images[0][i], images[1][i], images[2][i]];

@@ -20,6 +20,7 @@ pub(crate) struct TileImages {
     pub depth: TileImage,
     pub opacity: TileImage,
     pub median: TileImage,
+    pub surface: TileImage,
     pub spread: TileImage,
     /// Unit length, or zero.
     pub normal: [TileImage; 3],
@@ -36,6 +37,7 @@ impl TileImages {
             depth: zero,
             opacity: zero,
             median: zero,
+            surface: zero,
             spread: zero,
             normal: [zero; 3],
             near: zero,
@@ -85,7 +87,7 @@ impl TileSurfels {
     }
 }
 
-/// Blends a tile. `DETAIL`: median and spread of depth. `NORMAL`: normals. `GROWTH`: looks for surfels near the
+/// Blends a tile. `DETAIL`: median, surface and spread of depth. `NORMAL`: normals. `GROWTH`: looks for surfels near the
 /// observed depth, in front or hidden.
 pub(crate) struct Blend<'a, const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> {
     pub surfels: &'a mut TileSurfels,
@@ -122,6 +124,7 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
                 let mut passing = pixels.inside(&constants).select(one, zero);
                 let (mut color, mut normal) = ([zero; 3], [zero; 3]);
                 let (mut depth, mut depth_squared, mut median) = (zero, zero, zero);
+                let (mut surface, mut surface_depth) = (zero, zero);
                 let (mut near, mut counted) = (zero, zero);
                 let observed = Lanes::load(simd, &self.observed.depth, at);
                 let tolerance = Lanes::load(simd, &self.observed.tolerance, at);
@@ -152,6 +155,16 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
                     if DETAIL {
                         depth_squared = weighted_depth.mul_add(hit.depth, depth_squared);
                         median = half.less(passing).and(after.at_most(half)).select(hit.depth, median);
+                        // One surface is what lies together; the first that outweighs what came before it counts.
+                        let alpha = live.select(hit.alpha, zero);
+                        let gap = hit.depth.mul_add(surface, zero - surface_depth).abs();
+                        let joins = gap.at_most(constants.surface_relative * hit.depth * surface);
+                        let replaces = surface.less(alpha);
+                        let kept = replaces.select(zero, surface);
+                        let added = joins.or(replaces).select(alpha, zero);
+                        surface = joins.select(surface, kept) + added;
+                        let kept = replaces.select(zero, surface_depth);
+                        surface_depth = added.mul_add(hit.depth, joins.select(surface_depth, kept));
                     }
                     if NORMAL {
                         // The normal that faces the camera: its plane's offset is negative.
@@ -180,6 +193,8 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
                     let variance = depth_squared * share - expected * expected;
                     variance.max(zero).sqrt().store(&mut out.spread, at);
                     median.store(&mut out.median, at);
+                    let found = zero.less(surface);
+                    found.select(surface_depth / surface, zero).store(&mut out.surface, at);
                 }
                 if NORMAL {
                     let squared =

@@ -175,6 +175,7 @@ fn empty(camera: &Intrinsics, growth: bool, outputs: Outputs) -> Rendering {
         color: triple(true),
         depth_m: number(true),
         median_depth_m: number(outputs.depth_detail),
+        surface_depth_m: number(outputs.depth_detail),
         depth_spread_m: number(outputs.depth_detail),
         opacity: number(true),
         normal: triple(outputs.normal),

@@ -43,6 +43,7 @@ pub(crate) struct Constants<S: Simd> {
     pub transmittance_min: Lanes<S>,
     /// One over the low-pass's variance.
     pub low_pass: Lanes<S>,
+    pub surface_relative: Lanes<S>,
 }
 
 impl<S: Simd> Constants<S> {
@@ -60,6 +61,7 @@ impl<S: Simd> Constants<S> {
             alpha_min: number(settings.alpha_min),
             transmittance_min: number(settings.transmittance_min),
             low_pass: number(1.0 / (settings.low_pass_px * settings.low_pass_px)),
+            surface_relative: number(settings.surface_relative),
         }
     }
 }

@@ -48,6 +48,9 @@ pub struct Rendering {
     pub depth_m: Image<f32>,
     /// Depth at which half of the light is blocked, metres; 0 where it never is.
     pub median_depth_m: Image<f32>,
+    /// Mean depth of the front surface's hits by their alpha alone, metres; 0 where nothing was hit. Expected depth
+    /// is drawn towards the camera, as nearer surfels of one surface hide those behind; this is not.
+    pub surface_depth_m: Image<f32>,
     /// Standard deviation of depth within the blend, metres.
     pub depth_spread_m: Image<f32>,
     /// A, 0..1.

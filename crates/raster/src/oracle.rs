@@ -32,6 +32,8 @@ pub struct OraclePixel {
     pub opacity: f64,
     /// Depth at which half of the light is blocked, 0 where it never is.
     pub median: f64,
+    /// Mean depth of the front surface's hits.
+    pub surface: f64,
 }
 
 /// The surfels of all submaps in the camera's frame.
@@ -97,6 +99,7 @@ fn pixel(
     settings: &RenderSettings,
 ) -> OraclePixel {
     let (mut passing, mut depth_sum) = (1.0f64, 0.0f64);
+    let (mut surface, mut surface_sum) = (0.0f64, 0.0f64);
     let mut out = OraclePixel::default();
     for s in order {
         let (alpha, depth) = hit(s, x, y, camera, settings);
@@ -112,9 +115,16 @@ fn pixel(
         if passing > 0.5 && after <= 0.5 {
             out.median = depth;
         }
+        let together = (depth * surface - surface_sum).abs() <= settings.surface_relative as f64 * depth * surface;
+        if together {
+            (surface, surface_sum) = (surface + alpha, surface_sum + alpha * depth);
+        } else if surface < alpha {
+            (surface, surface_sum) = (alpha, alpha * depth);
+        }
         passing = after;
     }
     out.opacity = 1.0 - passing;
+    out.surface = if surface > 0.0 { surface_sum / surface } else { 0.0 };
     out.depth = if out.opacity > 0.0 { depth_sum / out.opacity } else { 0.0 };
     out
 }

@@ -17,6 +17,8 @@ pub struct RenderSettings {
     pub transmittance_min: f32,
     /// Standard deviation of the screen-space low-pass, pixels (2D Gaussian Splatting: sqrt(2)/2).
     pub low_pass_px: f32,
+    /// Hits that lie within this share of the depth are one surface (for the surface depth).
+    pub surface_relative: f32,
 }
 
 impl Default for RenderSettings {
@@ -26,6 +28,7 @@ impl Default for RenderSettings {
             alpha_min: 1.0 / 255.0,
             transmittance_min: 1e-4,
             low_pass_px: std::f32::consts::FRAC_1_SQRT_2,
+            surface_relative: 0.015,
         }
     }
 }
@@ -48,7 +51,7 @@ pub struct GrowthTest<'a> {
 /// left empty (0 x 0).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Outputs {
-    /// Median and spread of depth.
+    /// Median, surface and spread of depth.
     pub depth_detail: bool,
     /// Normals.
     pub normal: bool,

@@ -260,6 +260,7 @@ fn depth_along_a_tilted_surfel_is_that_of_the_ray_s_hit() {
     let truth = normal.z * 2.0 / normal.dot(&ray);
     assert!((rendering.depth_m[(28, 17)] - truth).abs() < 1e-4);
     assert!((rendering.median_depth_m[(28, 17)] - truth).abs() < 1e-4);
+    assert!((rendering.surface_depth_m[(28, 17)] - truth).abs() < 1e-4);
     assert!(rendering.normal[(28, 17)][2] < 0.0, "it faces the camera");
 }
 

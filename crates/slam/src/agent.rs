@@ -9,6 +9,7 @@
 //! whatever the network does.
 
 use crate::log::{OdometryEdge, SubmapOpened};
+use crate::mapping::inherit::Inheritance;
 use crate::mapping::submap::{ActiveSubmap, MappedFrame, MappingSettings};
 use crate::odometry;
 use crate::tracking::align::Brightness;
@@ -280,7 +281,7 @@ impl Agent {
         self.recent = None;
         let chain = self.next_chain;
         self.next_chain += 1;
-        let (_, opened) = self.open_submap(&frame, chain, self.last_pose);
+        let (_, opened) = self.open_submap(&frame, chain, self.last_pose, Inheritance::default());
         let mut outcome = self.keep(frame, view, tracked, FrameOptions { map: true, ..options });
         outcome.events.insert(0, opened);
         outcome
@@ -297,11 +298,16 @@ impl Agent {
         self.guesses = 0;
         self.brightness = tracked.brightness;
         let mut events = Vec::new();
+        let mut inherited = None;
         if options.map && self.active.as_ref().is_some_and(|a| a.is_full(&self.settings.mapping)) {
+            inherited = self.active.as_ref().map(|active| {
+                let submap_from_anchor = active.agent_from_submap.inv_mul(&tracked.agent_from_camera);
+                active.bequeath(&submap_from_anchor, &view, &self.settings.mapping)
+            });
             events.extend(self.close_active());
         }
         if self.active.is_none() {
-            events.extend(self.follow_recent(&frame, &tracked));
+            events.extend(self.follow_recent(&frame, &tracked, inherited.unwrap_or_default()));
         }
         let mut mapped = MappedFrame::default();
         let pose = self.active.as_mut().map(|active| {
@@ -309,6 +315,7 @@ impl Agent {
             if options.map {
                 mapped = active.map(
                     &frame,
+                    &view,
                     &submap_from_camera,
                     tracked.brightness,
                     tracked.map_at_once,
@@ -362,11 +369,16 @@ impl Agent {
     }
 
     /// Opens the submap after the last closed one, in its chain and tied to it.
-    fn follow_recent(&mut self, frame: &Arc<RgbdFrame>, tracked: &Tracked) -> Vec<Event> {
+    fn follow_recent(
+        &mut self,
+        frame: &Arc<RgbdFrame>,
+        tracked: &Tracked,
+        inherited: Inheritance,
+    ) -> Vec<Event> {
         let Some(recent) = &self.recent else { return Vec::new() };
         let (from, chain) = (recent.id.clone(), recent.chain);
         let from_from_to = recent.agent_from_submap.inv_mul(&tracked.agent_from_camera);
-        let (to, opened) = self.open_submap(frame, chain, tracked.agent_from_camera);
+        let (to, opened) = self.open_submap(frame, chain, tracked.agent_from_camera, inherited);
         let information = odometry::information(&from_from_to, &tracked.covariance, frame);
         vec![opened, Event::Odometry(OdometryEdge { from, to, from_from_to, information })]
     }
@@ -376,10 +388,11 @@ impl Agent {
         frame: &Arc<RgbdFrame>,
         chain: u32,
         agent_from_submap: Pose,
+        inherited: Inheritance,
     ) -> (SubmapId, Event) {
         let id = SubmapId { agent: self.id.clone(), epoch: self.epoch, number: self.next_submap };
         self.next_submap += 1;
-        self.active = Some(ActiveSubmap::open(id.clone(), chain, agent_from_submap));
+        self.active = Some(ActiveSubmap::open(id.clone(), chain, agent_from_submap, inherited));
         let opened = SubmapOpened {
             id: id.clone(),
             anchor_frame: self.frames - 1,

@@ -13,6 +13,7 @@ fn numbers(rendering: &Rendering, gradients: &Gradients) -> Vec<(&'static str, V
         ("opacity", rendering.opacity.pixels().to_vec()),
         ("near", near.collect()),
         ("median", rendering.median_depth_m.pixels().to_vec()),
+        ("surface", rendering.surface_depth_m.pixels().to_vec()),
         ("spread", rendering.depth_spread_m.pixels().to_vec()),
         ("normal", flat(&rendering.normal)),
         ("by centre", of(|g| g.center_m.concat())),
@@ -83,8 +84,8 @@ fn every_instruction_set_sees_the_same() {
         // A hit at the least alpha may fall to either side.
         assert!(found.0.abs_diff(truth.0) <= 20, "{arch:?}: {} hits, {}", found.0, truth.0);
         for ((name, a), (_, b)) in truth.1.iter().zip(&found.1) {
-            // The median jumps from one surfel to the next, and near is yes or no.
-            let limit = if ["median", "near"].contains(name) { 0.02 } else { 2e-3 };
+            // The median jumps from one surfel to the next, the surface from one to another, and near is yes or no.
+            let limit = if ["median", "surface", "near"].contains(name) { 0.02 } else { 2e-3 };
             let found = difference(a, b);
             assert!(found < limit, "{arch:?}: {name} differs by {found}");
         }
@@ -102,7 +103,7 @@ fn what_is_not_wanted_is_empty_and_changes_nothing_else() {
         assert_eq!(all.0, some.0);
         for ((name, a), (_, b)) in all.1.iter().zip(&some.1) {
             let wanted = match *name {
-                "median" | "spread" => outputs.depth_detail,
+                "median" | "surface" | "spread" => outputs.depth_detail,
                 "normal" => outputs.normal,
                 _ => true,
             };

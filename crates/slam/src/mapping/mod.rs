@@ -1,5 +1,7 @@
 //! What does the camera see? Surfels are seeded, grown, optimised and pruned.
 
+pub mod fuse;
+pub mod inherit;
 pub mod optimise;
 pub mod seed;
 pub mod ssim;

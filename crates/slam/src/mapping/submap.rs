@@ -1,12 +1,16 @@
 //! The submap under work: surfels in its own frame, its keyframes, and how they grow.
 
+use super::fuse::{FuseSettings, fuse};
+use super::inherit::{InheritSettings, Inheritance, inherit};
 use super::optimise::{Adam, Loss, OptimiseSettings, Target, optimise_once};
 use super::seed::{SeedSettings, seed};
 use crate::tracking::align::Brightness;
+use crate::tracking::view::TrackingView;
 use coma_frame::{Image, RgbdFrame};
 use coma_geometry::{Pose, SubmapId, se3};
 use coma_raster::{GrowthTest, RenderSettings, SubmapView};
 use coma_surfel::SurfelCloud;
+use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
 
 /// How submaps are filled and closed.
@@ -15,6 +19,10 @@ use serde::{Deserialize, Serialize};
 pub struct MappingSettings {
     /// How pixels become surfels.
     pub seed: SeedSettings,
+    /// How surfels follow what later frames measure.
+    pub fuse: FuseSettings,
+    /// What a new submap takes over from the one before.
+    pub inherit: InheritSettings,
     /// How surfels are optimised.
     pub optimise: OptimiseSettings,
     /// A mapping keyframe every so many mapped frames (paper: N_opt = 5).
@@ -43,6 +51,8 @@ impl Default for MappingSettings {
     fn default() -> Self {
         MappingSettings {
             seed: SeedSettings::default(),
+            fuse: FuseSettings::default(),
+            inherit: InheritSettings::default(),
             optimise: OptimiseSettings::default(),
             keyframe_every: 5,
             steps_per_keyframe: 6,
@@ -70,6 +80,8 @@ pub struct ActiveSubmap {
     pub surfels: SurfelCloud,
     /// Grows whenever surfels change.
     pub revision: u64,
+    /// Of each surfel's position along its normal.
+    variance_m2: Vec<f32>,
     adam: Adam,
     keyframes: Vec<Target>,
     mapped_frames: u32,
@@ -94,13 +106,15 @@ pub struct MappedFrame {
 }
 
 impl ActiveSubmap {
-    /// A submap without surfels; map its anchor next.
-    pub fn open(id: SubmapId, chain: u32, agent_from_submap: Pose) -> Self {
+    /// A submap with what it inherits; map its anchor next.
+    pub fn open(id: SubmapId, chain: u32, agent_from_submap: Pose, inherited: Inheritance) -> Self {
+        let Inheritance { surfels, variance_m2 } = inherited;
         ActiveSubmap {
             id,
             chain,
             agent_from_submap,
-            surfels: SurfelCloud::default(),
+            surfels,
+            variance_m2,
             revision: 0,
             adam: Adam::default(),
             keyframes: Vec::new(),
@@ -121,6 +135,7 @@ impl ActiveSubmap {
     pub fn map(
         &mut self,
         frame: &RgbdFrame,
+        view: &TrackingView,
         submap_from_camera: &Pose,
         brightness: Brightness,
         urgent: bool,
@@ -130,7 +145,11 @@ impl ActiveSubmap {
     ) -> MappedFrame {
         let mut out = MappedFrame::default();
         let color = corrected_color(&frame.color, brightness);
-        let views = [SubmapView { surfels: &self.surfels, camera_from_submap: submap_from_camera.inverse() }];
+        let camera_from_submap = submap_from_camera.inverse();
+        if settings.fuse.enabled {
+            fuse(&mut self.surfels, &mut self.variance_m2, view, &camera_from_submap, &settings.fuse);
+        }
+        let views = [SubmapView { surfels: &self.surfels, camera_from_submap }];
         let test = GrowthTest {
             observed_depth_m: &frame.depth_m,
             noise: frame.noise,
@@ -147,7 +166,12 @@ impl ActiveSubmap {
         let new_surfels = seed(frame, submap_from_camera, &settings.seed, is_new, |x, y| color[(x, y)]);
         out.added = new_surfels.len();
         out.new_share = new_share(&frame.depth_m, is_new);
-        new_surfels.into_iter().for_each(|s| self.surfels.push(s));
+        for surfel in new_surfels {
+            let depth_m = (camera_from_submap * Point3::from(surfel.center_m).cast::<f64>()).z as f32;
+            let sigma = frame.noise.sigma_m(depth_m);
+            self.variance_m2.push(sigma * sigma);
+            self.surfels.push(surfel);
+        }
         self.adam.resize(self.surfels.len());
 
         let (moved_m, moved_rad) = se3::distance(&self.last_counted, submap_from_camera);
@@ -208,6 +232,18 @@ impl ActiveSubmap {
             out.steps += 1;
             out.loss = Some(loss);
         }
+    }
+
+    /// What a submap whose anchor is at `submap_from_anchor` and sees `view` takes over from this one.
+    pub fn bequeath(
+        &self,
+        submap_from_anchor: &Pose,
+        view: &TrackingView,
+        settings: &MappingSettings,
+    ) -> Inheritance {
+        let seed_px = settings.seed.spacing_px.max(1) as f32 * settings.seed.scale_in_spacings;
+        let anchor_from_submap = submap_from_anchor.inverse();
+        inherit(&self.surfels, &self.variance_m2, &anchor_from_submap, view, seed_px, &settings.inherit)
     }
 
     /// The finished submap's surfels, pruned.

@@ -42,22 +42,21 @@ impl Model<'_> {
             })
             .collect();
         let rendering = coma_raster::render(&views, camera, self.render, None);
-        let depth_m = trusted_depth(&rendering, like, settings);
+        let depth_m = trusted_depth(&rendering, settings);
         let intensity = rendering.color.map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]);
         let view = TrackingView::build(*camera, depth_m, intensity, like.noise, like.levels.len());
         ModelPicture { view, hits: rendering.hits }
     }
 }
 
-/// Expected depth where the blend is one surface (its spread is under 2 sigma(z)), otherwise the median
-/// depth; none where the model is not opaque.
-fn trusted_depth(rendering: &Rendering, like: &TrackingView, settings: &TrackingSettings) -> Image<f32> {
-    let mut out = rendering.depth_m.clone();
-    for (i, z) in out.pixels_mut().iter_mut().enumerate() {
-        if !(rendering.opacity.pixels()[i] > settings.model_opacity) {
+/// Depth of the front surface; none where the model is not opaque. Expected depth lies nearer than the surfaces that it
+/// blends, by a millimetre or two: every submap would inherit that from the one before, and the camera would drift
+/// backwards.
+fn trusted_depth(rendering: &Rendering, settings: &TrackingSettings) -> Image<f32> {
+    let mut out = rendering.surface_depth_m.clone();
+    for (z, opacity) in out.pixels_mut().iter_mut().zip(rendering.opacity.pixels()) {
+        if !(*opacity > settings.model_opacity) {
             *z = 0.0;
-        } else if !(rendering.depth_spread_m.pixels()[i] < 2.0 * like.noise.sigma_m(*z)) {
-            *z = rendering.median_depth_m.pixels()[i];
         }
     }
     out

@@ -1,0 +1,109 @@
+//! Surfels follow what later frames measure: one Kalman filter per surfel, along its normal.
+//!
+//! Depth noise is averaged out frame by frame, as a fused volume (Curless and Levoy 1996) or surfel fusion (Keller et
+//! al. 2013, "Real-time 3D reconstruction in dynamic scenes using point-based fusion") does it, at the cost of one look
+//! at each surfel. The optimiser is left with what depth doesn't say: colour, opacity and extent.
+
+use crate::tracking::view::TrackingView;
+use coma_geometry::Pose;
+use coma_surfel::SurfelCloud;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// How surfels follow measurements.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FuseSettings {
+    /// Off: surfels stay where they were born, or where the optimiser moves them.
+    pub enabled: bool,
+    /// A measurement within so many standard deviations is of the surfel's surface ...
+    pub gate_sigma: f32,
+    /// ... and also one within this share of the depth.
+    pub gate_relative: f32,
+    /// A surfel is never surer than after so many independent frames.
+    pub most_frames: f32,
+}
+
+impl Default for FuseSettings {
+    fn default() -> Self {
+        FuseSettings { enabled: true, gate_sigma: 3.0, gate_relative: 0.005, most_frames: 40.0 }
+    }
+}
+
+/// Surfels of one task.
+const PART: usize = 4096;
+/// Normals that differ by more than 45 degrees are of different surfaces.
+const ALIKE_COS: f32 = 0.7;
+
+/// Moves surfels by what `view`, seen from `camera_from_submap`, measures of them. `variance_m2` is that of their
+/// position along their normal, one per surfel.
+pub fn fuse(
+    surfels: &mut SurfelCloud,
+    variance_m2: &mut [f32],
+    view: &TrackingView,
+    camera_from_submap: &Pose,
+    settings: &FuseSettings,
+) {
+    let rotation = camera_from_submap.rotation.to_rotation_matrix().matrix().cast::<f32>();
+    let translation: Vector3<f32> = camera_from_submap.translation.vector.cast();
+    let level = &view.levels[0];
+    let camera = &level.camera;
+    let (fx, fy, cx, cy) = (camera.fx as f32, camera.fy as f32, camera.cx as f32, camera.cy as f32);
+    let (width, height) = (level.depth_m.width() as f32, level.depth_m.height() as f32);
+    let one = |center: &mut [f32; 3], turn: &mut [f32; 4], variance: &mut f32| {
+        let p = rotation * Vector3::from(*center) + translation;
+        if !(p.z > 0.05) {
+            return;
+        }
+        let (u, v) = (fx * p.x / p.z + cx + 0.5, fy * p.y / p.z + cy + 0.5);
+        if !(u >= 0.0 && v >= 0.0 && u < width && v < height) {
+            return;
+        }
+        let pixel = (u as usize, v as usize);
+        let (z, seen) = (level.depth_m[pixel], Vector3::from(level.normal[pixel]));
+        if !(z > 0.0) || seen == Vector3::zeros() {
+            return;
+        }
+        let [qw, qx, qy, qz] = *turn;
+        let orientation = UnitQuaternion::new_unchecked(Quaternion::new(qw, qx, qy, qz));
+        let submap_normal = orientation * Vector3::z();
+        let own = rotation * submap_normal;
+        // Seeded surfels face the camera; one that is seen from behind is another surface.
+        if !(own.dot(&seen) > ALIKE_COS) {
+            return;
+        }
+        let ray = Vector3::new((pixel.0 as f32 - cx) / fx, (pixel.1 as f32 - cy) / fy, 1.0);
+        let along = own.dot(&ray);
+        let sigma = view.noise.sigma_m(z);
+        let off = own.dot(&(ray * z - p));
+        let off_z = off / along.abs().max(0.1);
+        if !(off_z.abs() <= settings.gate_sigma * (*variance + sigma * sigma).sqrt() + settings.gate_relative * z) {
+            return;
+        }
+        let least = sigma * sigma / settings.most_frames;
+        let gain = *variance / (*variance + sigma * sigma);
+        *variance = (*variance * (1.0 - gain)).max(least);
+        let step = submap_normal * (gain * off);
+        for (c, by) in center.iter_mut().zip(step.iter()) {
+            *c += by;
+        }
+        let wanted = rotation.tr_mul(&seen);
+        let turned = (submap_normal * (1.0 - gain) + wanted * gain).normalize();
+        if let Some(by) = UnitQuaternion::rotation_between(&submap_normal, &turned) {
+            let q = UnitQuaternion::new_normalize((by * orientation).into_inner());
+            *turn = [q.w, q.i, q.j, q.k];
+        }
+    };
+    (
+        surfels.center_m.par_chunks_mut(PART),
+        surfels.rotation_wxyz.par_chunks_mut(PART),
+        variance_m2.par_chunks_mut(PART),
+    )
+        .into_par_iter()
+        .for_each(|(centers, turns, variances)| {
+            for ((center, turn), variance) in centers.iter_mut().zip(turns).zip(variances) {
+                one(center, turn, variance);
+            }
+        });
+}
