@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// One scale of coloured ICP.
+/// One scale of refinement.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Scale {
@@ -12,6 +12,17 @@ pub struct Scale {
     pub max_correspondence_m: f32,
     /// Most Gauss-Newton steps.
     pub iterations: usize,
+}
+
+/// What refines a coarse pose.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Refiner {
+    /// Coloured ICP: surfaces and brightness.
+    #[default]
+    Coloured,
+    /// Generalised ICP: surfaces alone.
+    Generalised,
 }
 
 /// Settings of [`align`](crate::align()).
@@ -24,7 +35,9 @@ pub struct Settings {
     pub max_depth_m: f32,
     /// A pixel whose neighbour's depth differs by more than this share of its own lies on an edge and is left out.
     pub depth_jump: f32,
-    /// Scales of coloured ICP, coarse to fine. The first one is also that of the features.
+    /// What refines a coarse pose. Information and verification are the same for both.
+    pub refiner: Refiner,
+    /// Scales of refinement, coarse to fine. The first one is also that of the features.
     pub scales: Vec<Scale>,
     /// Radius of a feature's neighbourhood in voxels of the first scale (Open3D's 5).
     pub feature_radius_voxels: f32,
@@ -96,6 +109,7 @@ impl Default for Settings {
             working_width: 320,
             max_depth_m: 4.0,
             depth_jump: 0.05,
+            refiner: Refiner::Coloured,
             scales: vec![
                 Scale { voxel_m: 0.05, max_correspondence_m: 0.15, iterations: 15 },
                 Scale { voxel_m: 0.025, max_correspondence_m: 0.07, iterations: 15 },

@@ -114,6 +114,29 @@ impl Known<'_> {
         Passed { matches: share(&|overlap| overlap >= SAME), others: share(&|overlap| overlap < OTHER) }
     }
 
+    /// Thresholds that let 97 % of the matches of this sequence pass: recall first, registration decides. `None`
+    /// without matches.
+    pub fn proposed(&self) -> Option<Thresholds> {
+        /// Share of the matches that each of the two may hold back.
+        const HELD_BACK: f64 = 0.015;
+        let n = self.ids.len();
+        let pairs = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
+        let matches: Vec<(usize, usize)> = pairs
+            .filter(|(i, j)| self.ids[*i].abs_diff(self.ids[*j]) > self.gap && self.overlap[*i][*j] >= SAME)
+            .collect();
+        let low = |score: &dyn Fn(usize, usize) -> f32| {
+            let mut scores: Vec<f32> = matches.iter().map(|(i, j)| score(*i, *j)).collect();
+            scores.sort_by(f32::total_cmp);
+            // Rounded down: thresholds are exceeded, not met.
+            let score = scores.get((scores.len() as f64 * HELD_BACK) as usize)?;
+            Some((score * 100.0 - 1e-3).floor() / 100.0)
+        };
+        Some(Thresholds {
+            theta_sim: low(&|i, j| self.similarity[i][j])?,
+            theta_multi: low(&|i, j| self.window_similarity(i, j))?,
+        })
+    }
+
     /// As candidates are verified: each frame of a window with its best counterpart in the other, on average.
     fn window_similarity(&self, i: usize, j: usize) -> f32 {
         let near =
@@ -185,5 +208,9 @@ mod tests {
             (1.0, 1.0, 1.0)
         );
         assert_eq!(scores.perturbed_hit, 0.5);
+        let proposed = known.proposed().unwrap();
+        assert_eq!((proposed.theta_sim, proposed.theta_multi), (0.49, 0.49), "just below the only match");
+        let passed = known.passed(proposed);
+        assert_eq!((passed.matches, passed.others), (1.0, 0.0));
     }
 }
