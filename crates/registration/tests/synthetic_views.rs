@@ -114,7 +114,8 @@ fn generalised_icp_finds_the_motion_by_surfaces_alone() {
     let outcome = align(&view(&FURNISHED, &a, false), &view(&FURNISHED, &b, false), &settings, 1);
     let Outcome::Accepted(found) = outcome else { panic!("{outcome:?}") };
     let (m, rad) = se3::distance(&truth, &found.target_from_source);
-    assert!(m < 0.01 && rad.to_degrees() < 0.3, "{m} m, {} degrees", rad.to_degrees());
+    // Without colour the noise of the depth is all that is left.
+    assert!(m < 0.02 && rad.to_degrees() < 0.5, "{m} m, {} degrees", rad.to_degrees());
     // Brightness that it does not look at must not make a wall observable.
     let wall = [([-50.0, -50.0, -50.0], [50.0, 50.0, 2.0])];
     let prepared = |p: &Pose| Prepared::new(&view(&wall, p, true), &settings, Side::Source).unwrap();
