@@ -9,6 +9,7 @@ mod export;
 mod fault;
 mod inspect;
 mod inspect_loops;
+mod models;
 mod play;
 mod progress;
 mod run;
@@ -46,6 +47,9 @@ enum Command {
     /// Shows what came of a run, and why.
     #[command(subcommand)]
     Inspect(Inspect),
+    /// Models that describe places, beside the builtin encoder.
+    #[command(subcommand)]
+    Models(models::Models),
     /// Writes synthetic data to disk.
     #[command(subcommand)]
     Synth(synth::Synth),
@@ -78,6 +82,7 @@ async fn main() -> anyhow::Result<()> {
         Command::Export(arguments) => export::run(arguments).await,
         Command::Inspect(Inspect::Loops(arguments)) => inspect_loops::run(&arguments),
         Command::Inspect(Inspect::Graph(arguments)) => inspect::graph(&arguments),
+        Command::Models(models) => models::run(&models),
         Command::Synth(synth) => synth::run(&synth),
         Command::Bench(bench) => bench::run(&bench),
     }

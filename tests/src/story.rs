@@ -89,11 +89,13 @@ impl Walk {
     }
 }
 
-/// Agents with a place-recognition and a dpgo that they share.
+/// Agents with a place-recognition and a dpgo that they share, unless a scenario gives each its own.
 pub struct Cast {
     agents: Vec<coma_agent::Handle>,
     channels: Vec<Channel>,
     place_recognition: coma_place_recognition::Handle,
+    /// Those of the second agent and so on, where each has its own.
+    more_place_recognition: Vec<coma_place_recognition::Handle>,
     dpgo: coma_dpgo::Handle,
     _data: tempfile::TempDir,
 }
@@ -106,15 +108,35 @@ impl Cast {
 
     /// The same, and all of them know these peers too.
     pub async fn start_with_peers(names: &[&str], peers: &[String]) -> Cast {
-        let place_recognition = coma_place_recognition::Server::start(Default::default()).await.unwrap();
-        let dpgo = coma_dpgo::Server::start(Default::default()).await.unwrap();
+        Self::start_with(names, peers, vec![PlaceRecognitionConfig::default()], DpgoConfig::default()).await
+    }
+
+    /// The same, with these settings of the services: place-recognition is shared, or there is one for each agent.
+    pub async fn start_with(
+        names: &[&str],
+        peers: &[String],
+        places: Vec<PlaceRecognitionConfig>,
+        dpgo: DpgoConfig,
+    ) -> Cast {
+        let mut started = Vec::new();
+        for config in places {
+            started.push(coma_place_recognition::Server::start(config).await.unwrap());
+        }
+        let more_place_recognition = started.split_off(1);
+        let place_recognition = started.remove(0);
+        let own: Vec<String> = more_place_recognition.iter().map(|handle| handle.url.clone()).collect();
+        let place_of = |agent: usize| match agent.checked_sub(1).and_then(|more| own.get(more)) {
+            Some(url) => url.clone(),
+            None => place_recognition.url.clone(),
+        };
+        let dpgo = coma_dpgo::Server::start(dpgo).await.unwrap();
         let data = tempfile::tempdir().unwrap();
         let mut agents: Vec<coma_agent::Handle> = Vec::new();
         for name in names {
             let config = AgentConfig {
                 agent_id: Some(AgentId::new(name).unwrap()),
                 data: data.path().join(name),
-                place_recognition: Some(place_recognition.url.clone()),
+                place_recognition: Some(place_of(agents.len())),
                 dpgo: Some(dpgo.url.clone()),
                 // Each greets those before it, and is followed back.
                 peers: agents.iter().map(|a| a.url.clone()).chain(peers.iter().cloned()).collect(),
@@ -127,7 +149,7 @@ impl Cast {
             channel(&agent.url, &Default::default(), &ByteLedger::default(), Class::Client).unwrap()
         };
         let channels = agents.iter().map(dial).collect();
-        Cast { agents, channels, place_recognition, dpgo, _data: data }
+        Cast { agents, channels, place_recognition, more_place_recognition, dpgo, _data: data }
     }
 
     /// Both services end, forget everything, and start anew at the same addresses.
@@ -159,6 +181,11 @@ impl Cast {
         let url = &self.dpgo.url;
         let to_dpgo = channel(url, &Default::default(), &ByteLedger::default(), Class::Local).unwrap();
         Ok(DpgoClient::new(to_dpgo).solve(request).await?.into_inner())
+    }
+
+    /// What an agent tells its users.
+    pub async fn warnings(&self, index: usize) -> Vec<String> {
+        self.agent(index).get_status(v1::GetStatusRequest {}).await.unwrap().into_inner().warnings
     }
 
     /// This agent's submaps.
@@ -251,6 +278,9 @@ impl Cast {
             agent.shutdown().await;
         }
         self.place_recognition.shutdown().await;
+        for service in self.more_place_recognition {
+            service.shutdown().await;
+        }
         self.dpgo.shutdown().await;
     }
 }

@@ -9,6 +9,8 @@ use image::{Rgb, RgbImage, imageops};
 const TILE: u32 = 480;
 /// Both clouds agree where their depths differ by less than this, metres, and 1 % of the depth.
 const AGREE_M: f32 = 0.02;
+/// A point covers its pixel and so many to every side: clouds are coarser than tiles.
+const REACH: usize = 1;
 /// Colours of the first cloud, the second, and of both together, for brightness 1.
 const FIRST: [f32; 3] = [255.0, 150.0, 40.0];
 const SECOND: [f32; 3] = [60.0, 150.0, 255.0];
@@ -132,11 +134,17 @@ fn seen(points: &[Point], eye: &Eye, width: u32, height: u32) -> Image<(f32, f32
     let mut out = Image::filled(width as usize, height as usize, (f32::INFINITY, 0.0));
     for (point, brightness) in points {
         let Some((u, v, depth)) = eye.look(point) else { continue };
-        let (u, v) = (u.round(), v.round());
-        if u >= 0.0 && v >= 0.0 && u < width as f64 && v < height as f64 {
-            let pixel = &mut out[(u as usize, v as usize)];
-            if (depth as f32) < pixel.0 {
-                *pixel = (depth as f32, *brightness);
+        let inside = |at: f64, length: u32| at >= 0.0 && at < length as f64;
+        if !(inside(u, width) && inside(v, height)) {
+            continue;
+        }
+        let (u, v) = (u as usize, v as usize);
+        for y in v.saturating_sub(REACH)..=(v + REACH).min(height as usize - 1) {
+            for x in u.saturating_sub(REACH)..=(u + REACH).min(width as usize - 1) {
+                let pixel = &mut out[(x, y)];
+                if (depth as f32) < pixel.0 {
+                    *pixel = (depth as f32, *brightness);
+                }
             }
         }
     }

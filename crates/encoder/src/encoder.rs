@@ -3,8 +3,6 @@
 use crate::session::{Model, port_named, shape_words, takes_image};
 use crate::{EncoderError, Manifest, RuntimeSettings, Thresholds, normalised_planes, resize_area};
 use coma_frame::Image;
-use std::fs::File;
-use std::io::BufReader;
 use std::path::Path;
 
 /// An image encoder: a model and its manifest. Calls from several threads wait for one another.
@@ -23,13 +21,7 @@ impl OnnxEncoder {
     pub fn open(manifest_path: &Path, settings: &RuntimeSettings) -> Result<OnnxEncoder, EncoderError> {
         let manifest = Manifest::load(manifest_path)?;
         let path = manifest_path.parent().unwrap_or(Path::new("")).join(&manifest.model);
-        let hash = hash_of(&path)?;
-        if let Some(expected) = &manifest.blake3
-            && !hash.to_hex().eq_ignore_ascii_case(expected)
-        {
-            let found = hash.to_hex().to_string();
-            return Err(EncoderError::Hash { path, found, expected: expected.clone() });
-        }
+        let hash = manifest.verify_file(&path)?;
         let model = Model::load(&path, settings, |inputs, outputs| {
             let (input, output) = (&manifest.input, &manifest.output);
             let port = port_named(inputs, "input", &input.name, &path)?;
@@ -120,11 +112,4 @@ impl OnnxEncoder {
             })
         })
     }
-}
-
-fn hash_of(path: &Path) -> Result<blake3::Hash, EncoderError> {
-    let failed = |source| EncoderError::File { path: path.to_owned(), source };
-    let mut hasher = blake3::Hasher::new();
-    hasher.update_reader(BufReader::new(File::open(path).map_err(failed)?)).map_err(failed)?;
-    Ok(hasher.finalize())
 }

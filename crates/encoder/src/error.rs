@@ -22,7 +22,7 @@ pub enum EncoderError {
         reason: String,
     },
     /// The model file is not the one that the manifest was written for.
-    #[error("{path} has BLAKE3 {found}, its manifest says {expected}", path = path.display())]
+    #[error("{path} has SHA-256 {found}, its manifest says {expected}", path = path.display())]
     Hash {
         /// The model's file.
         path: PathBuf,

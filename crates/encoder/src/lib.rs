@@ -8,6 +8,7 @@ mod error;
 mod manifest;
 mod pooling;
 mod preprocess;
+mod sha256;
 
 #[cfg(feature = "onnx")]
 mod encoder;
@@ -22,6 +23,7 @@ pub use error::EncoderError;
 pub use manifest::{Input, Manifest, Output, Thresholds};
 pub use pooling::Pooling;
 pub use preprocess::{normalised_planes, resize_area};
+pub use sha256::Sha256;
 
 #[cfg(feature = "onnx")]
 pub use encoder::OnnxEncoder;

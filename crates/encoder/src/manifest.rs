@@ -1,6 +1,6 @@
 //! What has to be known of a model to use it.
 
-use crate::{EncoderError, Pooling};
+use crate::{EncoderError, Pooling, Sha256};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -11,7 +11,7 @@ const MAX_SIDE: usize = 4096;
 ///
 /// ```toml
 /// model = "dinov2-vits14.onnx"   # relative to this file
-/// blake3 = "0123..."             # optional; `b3sum dinov2-vits14.onnx`
+/// sha256 = "0123..."             # optional; `sha256sum dinov2-vits14.onnx`
 ///
 /// [input]
 /// name = "pixel_values"
@@ -34,9 +34,9 @@ const MAX_SIDE: usize = 4096;
 pub struct Manifest {
     /// The model's file, relative to the manifest's.
     pub model: PathBuf,
-    /// BLAKE3 of the model's file, 64 hexadecimal digits; not checked where absent.
+    /// SHA-256 of the model's file, 64 hexadecimal digits, as publishers of models state it; not checked where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub blake3: Option<String>,
+    pub sha256: Option<String>,
     /// What the model takes.
     pub input: Input,
     /// What the model gives.
@@ -106,7 +106,7 @@ impl Manifest {
         let require = |ok: bool, reason: String| {
             if ok { Ok(()) } else { Err(EncoderError::Manifest { path: path.to_owned(), reason }) }
         };
-        let Manifest { blake3, input, output, thresholds, .. } = self;
+        let Manifest { sha256, input, output, thresholds, .. } = self;
         let side = |v: usize| (1..=MAX_SIDE).contains(&v);
         require(side(input.width), format!("input.width is {}, expected 1 to {MAX_SIDE}", input.width))?;
         require(side(input.height), format!("input.height is {}, expected 1 to {MAX_SIDE}", input.height))?;
@@ -127,16 +127,32 @@ impl Manifest {
             let right = (-1.0..=1.0).contains(&value);
             require(right, format!("thresholds.{field} is {value}, expected -1 to 1"))?;
         }
-        if let Some(hash) = blake3 {
+        if let Some(hash) = sha256 {
             let right = hash.len() == 64 && hash.bytes().all(|c| c.is_ascii_hexdigit());
-            require(right, format!("blake3 is {hash:?}, expected 64 hexadecimal digits"))?;
+            require(right, format!("sha256 is {hash:?}, expected 64 hexadecimal digits"))?;
         }
         Ok(())
     }
 
+    /// Hashes the model's file, which must have [`Manifest::sha256`] if that is stated.
+    ///
+    /// # Errors
+    /// [`EncoderError::File`] and [`EncoderError::Hash`].
+    pub fn verify_file(&self, path: &Path) -> Result<Sha256, EncoderError> {
+        let hash = Sha256::of_file(path)?;
+        match &self.sha256 {
+            Some(expected) if !hash.to_string().eq_ignore_ascii_case(expected) => Err(EncoderError::Hash {
+                path: path.to_owned(),
+                found: hash.to_string(),
+                expected: expected.clone(),
+            }),
+            _ => Ok(hash),
+        }
+    }
+
     /// The name of the descriptors' space: only descriptors of equal spaces are compared. A hash of the model's and of
     /// all that decides how it is used; file names and thresholds are no part of it.
-    pub fn space(&self, model_hash: &blake3::Hash) -> String {
+    pub fn space(&self, model_sha256: &Sha256) -> String {
         let Input { name: input_name, width, height, mean, std } = &self.input;
         let Output { name: output_name, dimension, pooling } = &self.output;
         let bits = |v: &[f32; 3]| v.map(f32::to_bits);
@@ -152,7 +168,7 @@ impl Manifest {
             bits(std)
         );
         let mut hasher = blake3::Hasher::new();
-        hasher.update(b"coma descriptor space 1").update(model_hash.as_bytes()).update(use_of_it.as_bytes());
+        hasher.update(b"coma descriptor space 1").update(&model_sha256.0).update(use_of_it.as_bytes());
         format!("onnx/{}", &hasher.finalize().to_hex()[..32])
     }
 }
@@ -189,7 +205,7 @@ mod tests {
     fn a_manifest_is_read_with_its_pooling() {
         let manifest = load(TEXT).unwrap();
         assert_eq!(manifest.output.pooling, Pooling::Gem { power: 3.0, skip_tokens: 1 });
-        assert_eq!(manifest.blake3, None);
+        assert_eq!(manifest.sha256, None);
     }
 
     #[test]
@@ -203,7 +219,7 @@ mod tests {
             ("theta_sim = 0.8", "theta_sim = 8.0", "thresholds.theta_sim is 8"),
             ("theta_sim = 0.8", "theta_zim = 0.8", "theta_zim"),
             ("name = \"tokens\"", "name = \"\"", "output.name is empty"),
-            ("model = \"m.onnx\"", "model = \"m.onnx\"\nblake3 = \"12\"", "blake3 is \"12\""),
+            ("model = \"m.onnx\"", "model = \"m.onnx\"\nsha256 = \"12\"", "sha256 is \"12\""),
             ("kind = \"gem\"", "kind = \"max\"", "max"),
         ];
         for (right, wrong, message) in cases {
@@ -216,7 +232,7 @@ mod tests {
     #[test]
     fn the_space_changes_with_model_and_use_but_not_with_thresholds() {
         let manifest = load(TEXT).unwrap();
-        let (one, two) = (blake3::hash(b"one"), blake3::hash(b"two"));
+        let (one, two) = (Sha256([1; 32]), Sha256([2; 32]));
         let space = manifest.space(&one);
         assert_eq!(space, load(&TEXT.replace("0.8", "0.7").replace("m.onnx", "n.onnx")).unwrap().space(&one));
         assert_ne!(space, manifest.space(&two));

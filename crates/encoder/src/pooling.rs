@@ -29,6 +29,16 @@ pub enum Pooling {
 }
 
 impl Pooling {
+    /// Its name in a manifest.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Pooling::None => "none",
+            Pooling::Cls => "cls",
+            Pooling::Mean { .. } => "mean",
+            Pooling::Gem { .. } => "gem",
+        }
+    }
+
     /// Words for the shape that this pooling takes.
     #[cfg_attr(not(feature = "onnx"), allow(dead_code, reason = "only the runtime's side reports shapes"))]
     pub(crate) fn expected_shape(&self, dimension: usize) -> String {

@@ -3,7 +3,7 @@
 
 mod common;
 
-use coma_encoder::{EncoderError, OnnxEncoder, RuntimeSettings};
+use coma_encoder::{EncoderError, OnnxEncoder, RuntimeSettings, Sha256};
 use coma_frame::Image;
 use common::{Node, Port, write_model};
 use std::path::{Path, PathBuf};
@@ -94,9 +94,8 @@ fn the_space_follows_model_and_manifest() {
 fn a_hash_that_fits_is_accepted() {
     let folder = tempfile::tempdir().unwrap();
     averaging(folder.path(), FREE_IMAGE);
-    let hash =
-        blake3::hash(&std::fs::read(folder.path().join("model.onnx")).unwrap()).to_hex().to_uppercase();
-    open(&write_manifest(folder.path(), |text| format!("blake3 = \"{hash}\"{text}"))).unwrap();
+    let hash = Sha256::of_file(&folder.path().join("model.onnx")).unwrap().to_string().to_uppercase();
+    open(&write_manifest(folder.path(), |text| format!("sha256 = \"{hash}\"{text}"))).unwrap();
 }
 
 #[test]
@@ -104,8 +103,8 @@ fn another_hash_and_a_missing_model_are_named() {
     let folder = tempfile::tempdir().unwrap();
     averaging(folder.path(), FREE_IMAGE);
     let wrong = "0".repeat(64);
-    let error = refused(&write_manifest(folder.path(), |text| format!("blake3 = \"{wrong}\"{text}")));
-    assert!(error.contains("model.onnx has BLAKE3") && error.contains(&wrong), "{error}");
+    let error = refused(&write_manifest(folder.path(), |text| format!("sha256 = \"{wrong}\"{text}")));
+    assert!(error.contains("model.onnx has SHA-256") && error.contains(&wrong), "{error}");
     let error = refused(&write_manifest(folder.path(), |text| text.replace("model.onnx", "absent.onnx")));
     assert!(error.contains("read ") && error.contains("absent.onnx"), "{error}");
 }

@@ -3,10 +3,11 @@
 
 use crate::descriptor::{Descriptor, Space, similarity};
 use crate::encoder::Thresholds;
-use crate::index::{ExactIndex, Index};
-use coma_geometry::SubmapId;
+use crate::index::{ExactIndex, Hit, Index};
+use coma_geometry::{AgentId, SubmapId};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::RangeInclusive;
 
 /// Settings of [`Candidates`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -14,15 +15,16 @@ use std::collections::{BTreeMap, BTreeSet};
 pub struct Settings {
     /// Within one life of one agent, anchors must be more than this many frames apart (the paper's tau_min).
     pub min_gap_frames: u64,
-    /// Anchors to either side that belong to a window.
-    pub window: u32,
+    /// Anchors at most this many frames before or after belong to an anchor's window. Frames, not anchors: what
+    /// counts is how far the camera has moved on. Calibrated on a real kitchen; wider ones see another place.
+    pub window_frames: u64,
     /// Most similar anchors that are looked at per query.
     pub nearest: usize,
 }
 
 impl Default for Settings {
     fn default() -> Self {
-        Settings { min_gap_frames: 20, window: 2, nearest: 20 }
+        Settings { min_gap_frames: 20, window_frames: 25, nearest: 20 }
     }
 }
 
@@ -37,16 +39,34 @@ pub struct Candidate {
     pub space: Space,
     /// Cosine of the two anchors.
     pub similarity: f32,
-    /// Mean cosine over all pairs of the two windows.
+    /// Mean cosine of the anchors of both windows with their best counterparts in the other window.
     pub window_similarity: f32,
 }
 
+/// Which anchors may answer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Filter {
+    /// Those of these agents; none: of all.
+    pub agents: Option<BTreeSet<AgentId>>,
+    /// Those whose frame lies in here. Frames of different agents or lives have no common count.
+    pub frames: RangeInclusive<u64>,
+}
+
+impl Default for Filter {
+    /// All of them.
+    fn default() -> Self {
+        Filter { agents: None, frames: 0..=u64::MAX }
+    }
+}
+
+/// Anchors' descriptors, searched one way or another.
+type AnchorIndex = Box<dyn Index<SubmapId> + Send + Sync>;
+
 /// All anchors known, and the pairs already proposed.
-#[derive(Clone, Debug)]
 pub struct Candidates {
     settings: Settings,
     thresholds: BTreeMap<Space, Thresholds>,
-    index: ExactIndex<SubmapId>,
+    index: AnchorIndex,
     anchors: BTreeMap<SubmapId, Anchor>,
     tried: BTreeSet<(SubmapId, SubmapId)>,
 }
@@ -63,13 +83,16 @@ type Rated = BTreeMap<(SubmapId, SubmapId), (f32, Candidate)>;
 impl Candidates {
     /// Empty. Spaces without thresholds are stored but propose nothing.
     pub fn new(settings: Settings, thresholds: BTreeMap<Space, Thresholds>) -> Self {
-        Candidates {
-            settings,
-            thresholds,
-            index: ExactIndex::default(),
-            anchors: BTreeMap::new(),
-            tried: BTreeSet::new(),
-        }
+        Self::with_index(settings, thresholds, Box::new(ExactIndex::default()))
+    }
+
+    /// The same, searched by another index, which must be empty.
+    pub fn with_index(
+        settings: Settings,
+        thresholds: BTreeMap<Space, Thresholds>,
+        index: AnchorIndex,
+    ) -> Self {
+        Candidates { settings, thresholds, index, anchors: BTreeMap::new(), tried: BTreeSet::new() }
     }
 
     /// Number of anchors.
@@ -102,6 +125,15 @@ impl Candidates {
     /// The spaces of an anchor's descriptors; none for an unknown anchor.
     pub fn spaces(&self, id: &SubmapId) -> impl Iterator<Item = &Space> + '_ {
         self.anchors.get(id).into_iter().flat_map(|anchor| anchor.descriptors.keys())
+    }
+
+    /// The anchors most similar to a descriptor, of those that the filter lets pass; no threshold counts.
+    pub fn similar(&self, descriptor: &Descriptor, count: usize, filter: &Filter) -> Vec<Hit<SubmapId>> {
+        let admit = |id: &SubmapId| {
+            filter.agents.as_ref().is_none_or(|agents| agents.contains(&id.agent))
+                && self.anchors.get(id).is_some_and(|anchor| filter.frames.contains(&anchor.frame))
+        };
+        self.index.query(descriptor, count, &admit)
     }
 
     /// The new candidates that `id` and its window take part in (a new anchor also completes the windows of
@@ -167,21 +199,46 @@ impl Candidates {
         }
     }
 
-    /// The ids from `window` before to `window` after, of the same life.
+    /// The anchors of the same life within [`Settings::window_frames`], `id` included; none for an unknown one.
     fn window(&self, id: &SubmapId) -> Vec<SubmapId> {
-        let first = id.number.saturating_sub(self.settings.window);
-        let last = id.number.saturating_add(self.settings.window);
-        (first..=last).map(|number| SubmapId { number, ..id.clone() }).collect()
+        let Some(anchor) = self.anchors.get(id) else { return Vec::new() };
+        let near = |(other, known): &(&SubmapId, &Anchor)| {
+            other.agent == id.agent
+                && other.epoch == id.epoch
+                && known.frame.abs_diff(anchor.frame) <= self.settings.window_frames
+        };
+        let before = self.anchors.range(..id).rev().take_while(near).map(|(other, _)| other.clone());
+        let mut ids: Vec<SubmapId> = before.collect();
+        ids.reverse();
+        ids.extend(self.anchors.range(id..).take_while(near).map(|(other, _)| other.clone()));
+        ids
     }
 
-    /// Mean similarity over all pairs of the two windows that have descriptors of the space.
+    /// How alike two windows are: each anchor's best counterpart in the other window, on average. The paper takes
+    /// the mean over all pairs, which also asks that the ends of both windows look alike; on a real kitchen the
+    /// best counterparts tell a place from another more often. Neighbours in time are no counterparts.
     fn window_similarity(&self, a: &SubmapId, b: &SubmapId, space: &Space) -> f32 {
-        let of = |id: &SubmapId| -> Vec<&Descriptor> {
-            self.window(id).iter().filter_map(|id| self.anchors.get(id)?.descriptors.get(space)).collect()
+        let of = |id: &SubmapId| -> Vec<(SubmapId, &Descriptor)> {
+            let known = |id: SubmapId| Some((id.clone(), self.anchors.get(&id)?.descriptors.get(space)?));
+            self.window(id).into_iter().filter_map(known).collect()
         };
         let (left, right) = (of(a), of(b));
-        let all: Vec<f32> = left.iter().flat_map(|x| right.iter().filter_map(|y| similarity(x, y))).collect();
-        if all.is_empty() { f32::NEG_INFINITY } else { all.iter().sum::<f32>() / all.len() as f32 }
+        let mut best: Vec<f32> = vec![f32::NEG_INFINITY; left.len() + right.len()];
+        for (i, (x, from)) in left.iter().enumerate() {
+            for (j, (y, to)) in right.iter().enumerate() {
+                let alike = similarity(from, to).filter(|_| self.far_enough(x, y));
+                for at in [i, left.len() + j] {
+                    best[at] = best[at].max(alike.unwrap_or(f32::NEG_INFINITY));
+                }
+            }
+        }
+        let (mut left, mut right) = (best[..left.len()].to_vec(), best[left.len()..].to_vec());
+        let mean = |best: &mut Vec<f32>| {
+            best.retain(|s| s.is_finite());
+            best.iter().sum::<f32>() / best.len() as f32
+        };
+        // Without any counterpart NaN, which passes no threshold.
+        0.5 * (mean(&mut left) + mean(&mut right))
     }
 }
 
@@ -218,7 +275,7 @@ mod tests {
     }
 
     fn empty() -> Candidates {
-        let thresholds = Thresholds { theta_sim: 0.8, theta_multi: 0.3 };
+        let thresholds = Thresholds { theta_sim: 0.8, theta_multi: 0.5 };
         Candidates::new(Settings::default(), BTreeMap::from([(space(), thresholds)]))
     }
 
@@ -250,6 +307,40 @@ mod tests {
             known.insert(id("d", n), n as u64 * 20, at(0, 0.1 * n as f32));
         }
         assert!(known.propose(&id("d", 2)).iter().any(|c| c.a == id("c", 2) && c.b == id("d", 2)));
+    }
+
+    #[test]
+    fn windows_are_as_alike_as_their_best_counterparts() {
+        let mut known = empty();
+        // The same walk, there and back; then anchors that are too far on to count.
+        for n in 0..5u32 {
+            known.insert(id("a", n), n as u64 * 20, at(n as usize, 0.0));
+            known.insert(id("b", n), n as u64 * 20, at(4 - n as usize, 0.0));
+        }
+        let found = known.propose(&id("b", 2));
+        let middle = found.iter().find(|c| c.a == id("a", 2) && c.b == id("b", 2)).unwrap();
+        assert!((middle.window_similarity - 1.0).abs() < 1e-6);
+        // Seen once more by itself, the middle of a has two strange neighbours.
+        known.insert(id("c", 0), 0, at(2, 0.0));
+        let found = known.of(&id("c", 0));
+        let lone = found.iter().find(|c| c.a == id("a", 2)).unwrap();
+        assert!(
+            (lone.window_similarity - 0.5 * (1.0 / 3.0 + 1.0)).abs() < 1e-6,
+            "{}",
+            lone.window_similarity
+        );
+    }
+
+    #[test]
+    fn neighbours_in_time_are_no_counterparts() {
+        let mut known = empty();
+        // One walk whose two windows share an anchor in the middle: it must not vouch for both.
+        known.insert(id("a", 0), 0, at(0, 0.0));
+        known.insert(id("a", 1), 20, at(5, 0.0));
+        known.insert(id("a", 2), 40, at(0, 0.1));
+        let found = known.of(&id("a", 2));
+        let similarity = found[0].window_similarity;
+        assert!((similarity - found[0].similarity).abs() < 1e-6, "{similarity}");
     }
 
     #[test]
@@ -297,5 +388,21 @@ mod tests {
         known.insert(id("a", 0), 0, at(0, 0.0));
         known.insert(id("b", 0), 0, at(0, 0.0));
         assert!(known.propose(&id("a", 0)).is_empty());
+    }
+
+    #[test]
+    fn similar_anchors_may_be_asked_for_by_agent_and_time() {
+        let mut known = empty();
+        for n in 0..4 {
+            known.insert(id("a", n), n as u64 * 20, at(0, 0.1 * n as f32));
+            known.insert(id("b", n), n as u64 * 20, at(0, 0.1 * n as f32));
+        }
+        let ask = |filter: &Filter| -> Vec<(String, u32)> {
+            let hits = known.similar(&at(0, 0.0), 10, filter);
+            hits.iter().map(|hit| (hit.key.agent.to_string(), hit.key.number)).collect()
+        };
+        assert_eq!(ask(&Filter::default()).len(), 8);
+        let only_b = Filter { agents: Some([AgentId::new("b").unwrap()].into()), frames: 20..=40 };
+        assert_eq!(ask(&only_b), [("b".to_owned(), 1), ("b".to_owned(), 2)]);
     }
 }

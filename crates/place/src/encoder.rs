@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 pub struct Thresholds {
     /// Least cosine similarity of two anchors.
     pub theta_sim: f32,
-    /// Least mean similarity over all pairs of the two windows of anchors.
+    /// Least mean similarity of the anchors of both windows with their best counterparts.
     pub theta_multi: f32,
 }
 

@@ -1,7 +1,10 @@
 //! The most similar descriptors.
 
-use crate::descriptor::{Descriptor, Space, dot};
+use crate::descriptor::{Descriptor, MAX_DIMENSION, Space, dot};
+use crate::saved::{self, Reader, SavedError};
 use rayon::prelude::*;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 
 /// One answer of an index.
@@ -123,12 +126,51 @@ impl<K: Ord + Clone + Send + Sync> Index<K> for ExactIndex<K> {
     }
 }
 
+impl<K: Ord + Clone + Serialize + DeserializeOwned + Send + Sync> ExactIndex<K> {
+    /// The index as bytes.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let head = |((space, dimension), block): (&(Space, usize), &Block<K>)| saved::Head {
+            space: space.clone(),
+            dimension: *dimension,
+            keys: block.keys.clone(),
+            bytes: block.values.len(),
+        };
+        let heads: Vec<_> = self.blocks.iter().map(head).collect();
+        let values = self.blocks.values().flat_map(|block| block.values.iter().map(|v| *v as u8));
+        saved::write(saved::EXACT, &heads, &values.collect::<Vec<u8>>())
+    }
+
+    /// The index that [`ExactIndex::to_bytes`] wrote.
+    ///
+    /// # Errors
+    /// Bytes that are damaged or of something else.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, SavedError> {
+        let mut reader = Reader::new(saved::EXACT, bytes)?;
+        let mut index = ExactIndex::default();
+        for saved::Head { space, dimension, keys, bytes } in reader.heads::<K>()? {
+            if !(1..=MAX_DIMENSION).contains(&dimension) {
+                return Err(SavedError::Field("dimension"));
+            }
+            let values = reader.take(bytes)?;
+            if Some(bytes) != keys.len().checked_mul(dimension) {
+                return Err(SavedError::Field("keys"));
+            }
+            for (key, values) in keys.into_iter().zip(values.chunks_exact(dimension)) {
+                let values = values.iter().map(|v| *v as i8).collect();
+                let descriptor = Descriptor::new(space.clone(), 1.0, values);
+                index.insert(key, &descriptor.map_err(|_| SavedError::Field("values"))?);
+            }
+        }
+        Ok(index)
+    }
+}
+
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::descriptor::similarity;
 
-    fn descriptor(space: &str, seed: u32) -> Descriptor {
+    pub(crate) fn descriptor(space: &str, seed: u32) -> Descriptor {
         let mut state = seed.wrapping_mul(2_654_435_761).wrapping_add(1);
         let values: Vec<f32> = (0..64)
             .map(|_| {
@@ -180,5 +222,23 @@ mod tests {
         index.insert(1u32, &descriptor("a", 2));
         assert_eq!(index.len(), 1);
         assert!((index.query(&descriptor("a", 2), 1, &|_| true)[0].similarity - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_saved_index_answers_as_before_and_damage_is_found() {
+        let mut index = ExactIndex::default();
+        for key in 0..200u32 {
+            index.insert(key, &descriptor(if key % 3 == 0 { "a" } else { "b" }, key));
+        }
+        let bytes = index.to_bytes();
+        let back = ExactIndex::<u32>::from_bytes(&bytes).unwrap();
+        assert_eq!(back.len(), 200);
+        for space in ["a", "b"] {
+            let ask = |index: &ExactIndex<u32>| index.query(&descriptor(space, 7), 20, &|k| k % 2 == 0);
+            assert_eq!(ask(&back), ask(&index));
+        }
+        for damaged in saved::tests::damaged(&bytes) {
+            assert!(ExactIndex::<u32>::from_bytes(&damaged).is_err());
+        }
     }
 }

@@ -1,11 +1,12 @@
 //! The whole way from two views to a verdict.
 
 use crate::consensus;
+use crate::gicp;
 use crate::icp::{self, Searchable};
 use crate::information::{Observability, information};
 use crate::matching::mutual_matches;
 use crate::outcome::{Alignment, Outcome, Reason, Side};
-use crate::settings::Settings;
+use crate::settings::{Refiner, Scale, Settings};
 use crate::verify;
 use crate::view::{Prepared, View};
 use coma_geometry::{Matrix6, Pose, se3};
@@ -70,7 +71,7 @@ pub fn decide(
     let (source_coarse, target_coarse) = searchable(source, target, 0, 1500);
     for hypothesis in &mut hypotheses {
         let initial = hypothesis.target_from_source;
-        match icp::refine_scale(&source_coarse, &target_coarse, &initial, &settings.scales[0], settings) {
+        match refine_scale(&source_coarse, &target_coarse, &initial, &settings.scales[0], settings) {
             Some(pose) => {
                 hypothesis.score = verify::evidence(source, target, &pose, settings).score;
                 hypothesis.target_from_source = pose;
@@ -170,7 +171,7 @@ pub fn coarse(
     Ok(out)
 }
 
-/// Multi-scale coloured ICP from an initial pose (good to about 15 cm and 10 degrees), with information and
+/// Multi-scale refinement from an initial pose (good to about 15 cm and 10 degrees), with information and
 /// the test that the scene pins the motion.
 pub fn refine(
     source: &Prepared,
@@ -185,8 +186,12 @@ pub fn refine(
     let mut residuals = Vec::new();
     for (level, scale) in settings.scales.iter().enumerate() {
         let (s, t) = searchable(source, target, level, settings.icp_points);
-        pose = icp::refine_scale(&s, &t, &pose, scale, settings).ok_or(diverged(0))?;
+        pose = refine_scale(&s, &t, &pose, scale, settings).ok_or(diverged(0))?;
         residuals = icp::linearise(&s, &t, &pose, scale.max_correspondence_m);
+        if settings.refiner == Refiner::Generalised {
+            // What the refiner did not look at pins nothing.
+            residuals.iter_mut().for_each(icp::Residual::forget_brightness);
+        }
         if level == 0 {
             // Judged where normals and gradients are calmest: their noise looks like structure.
             observability = Observability::new(&residuals, settings);
@@ -218,6 +223,19 @@ pub fn refine(
         correspondences: residuals.len(),
         effective_samples,
     })
+}
+
+fn refine_scale(
+    source: &Searchable,
+    target: &Searchable,
+    initial: &Pose,
+    scale: &Scale,
+    settings: &Settings,
+) -> Option<Pose> {
+    match settings.refiner {
+        Refiner::Coloured => icp::refine_scale(source, target, initial, scale, settings),
+        Refiner::Generalised => gicp::refine_scale(source, target, initial, scale),
+    }
 }
 
 fn searchable<'a>(

@@ -7,7 +7,7 @@ use crate::neighbours::Neighbours;
 use crate::settings::{Scale, Settings};
 use coma_frame::DepthNoise;
 use coma_geometry::{Matrix6, Pose, Tangent, se3};
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Isometry3, Point3, Vector3};
 use rayon::prelude::*;
 
 /// One correspondence, linearised: residuals and their derivatives by the right perturbation of
@@ -28,6 +28,14 @@ pub struct Residual {
     pub sigma_m: f64,
 }
 
+impl Residual {
+    /// Leaves the geometric part alone.
+    pub(crate) fn forget_brightness(&mut self) {
+        self.photometric = 0.0;
+        self.photometric_row = Tangent::zeros();
+    }
+}
+
 /// A cloud that can be searched.
 pub struct Searchable<'a> {
     cloud: &'a PointCloud,
@@ -44,6 +52,44 @@ impl<'a> Searchable<'a> {
         let queries = (0..count).map(|i| (i * cloud.len() / count) as u32).collect();
         Searchable { cloud, noise, tree: Neighbours::new(&cloud.points), queries }
     }
+
+    /// The cloud itself.
+    pub(crate) fn cloud(&self) -> &PointCloud {
+        self.cloud
+    }
+
+    /// Of the sensor that saw it.
+    pub(crate) fn noise(&self) -> DepthNoise {
+        self.noise
+    }
+
+    /// The counterpart in `into` of point `i`: the nearest one that faces the same way.
+    fn partner(
+        &self,
+        into: &Searchable,
+        into_from_self: &Isometry3<f32>,
+        i: usize,
+        max_m: f32,
+    ) -> Option<usize> {
+        let point = self.cloud.points[i];
+        let reach = max_m.max(3.0 * self.noise.sigma_m(point.z));
+        let (j, _) = into.tree.nearest(&(into_from_self * point), reach)?;
+        let own_normal = into_from_self.rotation * self.cloud.normals[i];
+        // A normal of zero fails this test too.
+        (into.cloud.normals[j].dot(&own_normal) > 0.5).then_some(j)
+    }
+}
+
+/// Queries of `from` with their counterparts in `into`.
+pub(crate) fn correspondences(
+    from: &Searchable,
+    into: &Searchable,
+    into_from_from: &Pose,
+    max_distance_m: f32,
+) -> Vec<(usize, usize)> {
+    let pose = into_from_from.cast::<f32>();
+    let partner = |&i: &u32| Some((i as usize, from.partner(into, &pose, i as usize, max_distance_m)?));
+    from.queries.par_iter().filter_map(partner).collect()
 }
 
 /// Linearised residuals of both directions at a pose, source queries first.
@@ -110,15 +156,9 @@ fn half(from: &Searchable, into: &Searchable, into_from_from: &Pose, max_distanc
         .filter_map(|&i| {
             let i = i as usize;
             let point = from.cloud.points[i];
-            let moved = pose * point;
             let sigma = from.noise.sigma_m(point.z);
-            let (j, _) = into.tree.nearest(&moved, max_distance_m.max(3.0 * sigma))?;
+            let j = from.partner(into, &pose, i, max_distance_m)?;
             let normal = into.cloud.normals[j];
-            let own_normal = pose.rotation * from.cloud.normals[i];
-            // A normal of zero fails this test too.
-            if !(normal.dot(&own_normal) > 0.5) {
-                return None;
-            }
             let sigma_into = into.noise.sigma_m(into.cloud.points[j].z);
             let moved = into_from_from * point.cast::<f64>();
             Some(Met {
@@ -199,7 +239,7 @@ pub fn depth_weight(sigma_m: f64) -> f64 {
 }
 
 /// A scale has converged when a step is below this many voxels (and as many radians per metre).
-const CONVERGED_VOXELS: f64 = 0.01;
+pub(crate) const CONVERGED_VOXELS: f64 = 0.01;
 
 /// Gauss-Newton at one scale. `None` if correspondences run out or the system is singular beyond damping.
 pub fn refine_scale(

@@ -1,15 +1,16 @@
 //! An information matrix that can be believed, and whether the shared scene pins the motion at all.
 //!
 //! The raw Hessian of 10^4 residuals claims a tenth of a millimetre, because neighbouring residuals err
-//! together. So: residuals within one image block count as one sample; directions that the scene hardly
-//! pins are inflated; and no standard deviation falls below a floor (calibration, rolling shutter and depth
-//! distortion do not average out).
+//! together. So: residuals within one small image block count as one sample; directions that the scene hardly
+//! pins are inflated; what large blocks disagree about is added (distorted depth, rolling shutter and a lens that
+//! is a little off bend each part of the image its own way, and do not average out); and no standard deviation
+//! falls below a floor.
 
 use crate::icp::{Residual, Scales, depth_weight};
 use crate::settings::Settings;
-use coma_geometry::{Intrinsics, Matrix6, se3};
+use coma_geometry::{Intrinsics, Matrix6, Tangent, se3};
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// How well a set of residuals pins each direction of motion.
 #[derive(Clone, Debug)]
@@ -96,14 +97,55 @@ pub fn information(
     let shrink = observability.ratios.map(|ratio| (ratio / settings.weak_ratio).clamp(1e-6, 1.0).sqrt());
     let s = observability.directions * Matrix6::from_diagonal(&shrink) * observability.directions.transpose();
     let inflated = forth.transpose() * s * back.transpose() * h * back * s * forth;
-    // The floor is added to the covariance: errors that do not average out are independent of the rest.
+    // Added to the covariance: errors that do not average out are independent of the rest.
     let mut covariance = symmetric(&inflated).cholesky()?.inverse();
+    let regional = Regional::of(residuals, &scales, source_camera, settings)?;
     for i in 0..3 {
-        covariance[(i, i)] += settings.floor_m.powi(2);
-        covariance[(i + 3, i + 3)] += settings.floor_rad.powi(2);
+        covariance[(i, i)] += regional.variance_m2 + settings.floor_m.powi(2);
+        covariance[(i + 3, i + 3)] += regional.variance_rad2 + settings.floor_rad.powi(2);
     }
     let information = symmetric(&covariance).cholesky()?.inverse();
     Some((symmetric(&information), samples))
+}
+
+/// How far the motion would move if it followed one part of the image or another.
+struct Regional {
+    variance_m2: f64,
+    variance_rad2: f64,
+}
+
+impl Regional {
+    /// The covariance of an estimator whose residuals err together within a block (the cluster-robust "sandwich"
+    /// H^-1 (sum over blocks of g g^T) H^-1; Liang & Zeger 1986), with the weights that the motion was found
+    /// with. A dozen blocks tell how much, but hardly in which direction: the mean over the axes counts for each.
+    fn of(residuals: &[Residual], scales: &Scales, camera: &Intrinsics, settings: &Settings) -> Option<Self> {
+        let block_px = (camera.width as f64 / settings.regions_across.max(1) as f64).max(1.0);
+        let mut h = Matrix6::zeros();
+        let mut gradients: BTreeMap<(i64, i64), Tangent> = BTreeMap::new();
+        for r in residuals {
+            let (wg, wp) = scales.weights(r);
+            let wg = wg * settings.geometric_share * depth_weight(r.sigma_m);
+            let wp = wp * (1.0 - settings.geometric_share);
+            h.syger(wg, &r.geometric_row, &r.geometric_row, 1.0);
+            h.syger(wp, &r.photometric_row, &r.photometric_row, 1.0);
+            if let Some(pixel) = camera.project(&r.source) {
+                let block = ((pixel.x / block_px).floor() as i64, (pixel.y / block_px).floor() as i64);
+                *gradients.entry(block).or_insert_with(Tangent::zeros) +=
+                    r.geometric_row * (wg * r.geometric_m) + r.photometric_row * (wp * r.photometric);
+            }
+        }
+        h.fill_upper_triangle_with_lower_triangle();
+        let outer: Matrix6 = gradients.values().map(|g| g * g.transpose()).sum();
+        // The six parameters were fitted to the same blocks.
+        let blocks = gradients.len() as f64;
+        let inverse = h.cholesky()?.inverse();
+        let covariance = inverse * outer * inverse * (blocks / (blocks - 6.0).max(1.0));
+        let mean = |first: usize| {
+            let trace: f64 = (first..first + 3).map(|i| covariance[(i, i)]).sum();
+            settings.regional_scale.powi(2) * trace / 3.0
+        };
+        Some(Regional { variance_m2: mean(0), variance_rad2: mean(3) })
+    }
 }
 
 fn symmetric(m: &Matrix6) -> Matrix6 {
@@ -160,12 +202,34 @@ mod tests {
         let (a, samples) = of(&once);
         let covariance = a.try_inverse().unwrap();
         for i in 0..3 {
-            assert!(covariance[(i, i)].sqrt() >= settings.floor_m && covariance[(i, i)].sqrt() < 0.02);
+            assert!(
+                covariance[(i, i)].sqrt() >= settings.floor_m && covariance[(i, i)].sqrt() < 0.02,
+                "{covariance}"
+            );
             assert!(covariance[(i + 3, i + 3)].sqrt() >= settings.floor_rad);
         }
         let tenfold: Vec<Residual> = (0..10).flat_map(|_| once.clone()).collect();
         let (b, same_samples) = of(&tenfold);
         assert_eq!(samples, same_samples);
         assert!((a - b).norm() < 1e-6 * a.norm());
+    }
+
+    #[test]
+    fn a_part_of_the_image_that_pulls_elsewhere_lowers_the_information() {
+        let settings = Settings::default();
+        let axes = [Vector3::z(), Vector3::x(), Vector3::y()];
+        let deviation_m = |residuals: &[Residual]| {
+            let seen = Observability::new(residuals, &settings).unwrap();
+            let (information, _) = information(residuals, &seen, &CAMERA, &settings).unwrap();
+            (information.try_inverse().unwrap().fixed_view::<3, 3>(0, 0).trace() / 3.0).sqrt()
+        };
+        let even = planes(&axes, 400);
+        let mut bent = even.clone();
+        // The same spread of residuals, but the left half lies behind and the right half before.
+        for r in &mut bent {
+            r.geometric_m = r.geometric_m.abs() * r.source.x.signum();
+        }
+        let (even_m, bent_m) = (deviation_m(&even), deviation_m(&bent));
+        assert!(bent_m > 1.5 * even_m, "{even_m} and {bent_m}");
     }
 }

@@ -7,7 +7,8 @@
 //! 3. [`fpfh`]: Fast Point Feature Histograms (Rusu, Blodow, Beetz 2009).
 //! 4. [`matching`]: mutual nearest neighbours among the features.
 //! 5. [`consensus`]: RANSAC over matches that keep distances and angles, several hypotheses.
-//! 6. [`icp`]: multi-scale coloured ICP (Park, Zhou, Koltun 2017), both directions in one system.
+//! 6. [`icp`]: multi-scale coloured ICP (Park, Zhou, Koltun 2017), both directions in one system; or [`gicp`],
+//!    generalised ICP (Segal, Haehnel, Thrun 2009), where brightness says nothing.
 //! 7. [`information`]: an information matrix that can be believed, and whether the scene pins all six degrees of freedom.
 //! 8. [`verify`]: overlap, free-space conflicts and photometric agreement at the found pose.
 //!
@@ -22,6 +23,7 @@ pub mod align;
 pub mod cloud;
 pub mod consensus;
 pub mod fpfh;
+pub mod gicp;
 pub mod icp;
 pub mod information;
 pub mod matching;
@@ -34,6 +36,6 @@ pub mod view;
 pub use align::{Hypothesis, align, align_prepared, coarse, decide, refine};
 pub use cloud::PointCloud;
 pub use outcome::{Alignment, Outcome, Reason, Side};
-pub use settings::Settings;
+pub use settings::{Refiner, Settings};
 pub use verify::{Evidence, verify};
 pub use view::{Prepared, View};

@@ -3,7 +3,7 @@
 use coma_frame::{DepthNoise, Image};
 use coma_geometry::nalgebra::{Point3, Vector3};
 use coma_geometry::{Intrinsics, Pose, Tangent, se3};
-use coma_registration::{Outcome, Prepared, Reason, Settings, Side, View, align, refine};
+use coma_registration::{Outcome, Prepared, Reason, Refiner, Settings, Side, View, align, refine};
 
 const CAMERA: Intrinsics = Intrinsics { width: 320, height: 240, fx: 260.0, fy: 260.0, cx: 159.5, cy: 119.5 };
 
@@ -104,6 +104,24 @@ fn a_known_motion_is_recovered_within_its_own_covariance() {
     let squared = (error.transpose() * found.information * error)[0];
     // Six degrees of freedom: the 99.9 % quantile of chi square is 22.5.
     assert!(squared < 22.5, "{squared}");
+}
+
+#[test]
+fn generalised_icp_finds_the_motion_by_surfaces_alone() {
+    let (a, b) = two_poses();
+    let truth = b.inv_mul(&a);
+    let settings = Settings { refiner: Refiner::Generalised, ..Settings::default() };
+    let outcome = align(&view(&FURNISHED, &a, false), &view(&FURNISHED, &b, false), &settings, 1);
+    let Outcome::Accepted(found) = outcome else { panic!("{outcome:?}") };
+    let (m, rad) = se3::distance(&truth, &found.target_from_source);
+    // Without colour the noise of the depth is all that is left.
+    assert!(m < 0.02 && rad.to_degrees() < 0.5, "{m} m, {} degrees", rad.to_degrees());
+    // Brightness that it does not look at must not make a wall observable.
+    let wall = [([-50.0, -50.0, -50.0], [50.0, 50.0, 2.0])];
+    let prepared = |p: &Pose| Prepared::new(&view(&wall, p, true), &settings, Side::Source).unwrap();
+    let wall = prepared(&Pose::identity());
+    let refined = refine(&wall, &prepared(&pose([0.03, 0.02, 0.0], [0.0; 3])), &Pose::identity(), &settings);
+    assert!(matches!(refined, Err(Reason::Unobservable { .. })), "{refined:?}");
 }
 
 #[test]

@@ -11,11 +11,12 @@
 use crate::log::{OdometryEdge, SubmapOpened};
 use crate::mapping::inherit::Inheritance;
 use crate::mapping::submap::{ActiveSubmap, MappedFrame, MappingSettings};
+use crate::odometry;
 use crate::tracking::align::Brightness;
 use crate::tracking::view::TrackingView;
 use crate::tracking::{self, Reason, State, Tracked, TrackingSettings, model::Model};
 use coma_frame::RgbdFrame;
-use coma_geometry::{AgentId, Epoch, Matrix6, Pose, StampNs, SubmapId, se3};
+use coma_geometry::{AgentId, Epoch, Matrix6, Pose, StampNs, SubmapId};
 use coma_raster::RenderSettings;
 use coma_surfel::SurfelCloud;
 use serde::{Deserialize, Serialize};
@@ -378,7 +379,7 @@ impl Agent {
         let (from, chain) = (recent.id.clone(), recent.chain);
         let from_from_to = recent.agent_from_submap.inv_mul(&tracked.agent_from_camera);
         let (to, opened) = self.open_submap(frame, chain, tracked.agent_from_camera, inherited);
-        let information = odometry_information(&from_from_to, &tracked.covariance);
+        let information = odometry::information(&from_from_to, &tracked.covariance, frame);
         vec![opened, Event::Odometry(OdometryEdge { from, to, from_from_to, information })]
     }
 
@@ -410,20 +411,4 @@ impl Agent {
         self.recent = Some(Recent { id: id.clone(), chain, surfels: surfels.clone(), agent_from_submap });
         Some(Event::SubmapClosed(id, surfels))
     }
-}
-
-/// Information of the motion across a submap: one frame's covariance for where the submap ends, and drift
-/// that grows with the way: 0.5 % of the distance, 0.5 % of the rotation and 1 mm and 0.05 degree per metre
-/// and radian across.
-fn odometry_information(from_from_to: &Pose, frame_covariance: &Matrix6) -> Matrix6 {
-    let (metres, radians) = se3::distance(&Pose::identity(), from_from_to);
-    let drift_m = 0.005 * metres + 0.002 * radians + 0.001;
-    let drift_rad = 0.005 * radians + 0.002 * metres + 0.05f64.to_radians();
-    let mut covariance = *frame_covariance;
-    for axis in 0..6 {
-        let drift = if axis < 3 { drift_m } else { drift_rad };
-        covariance[(axis, axis)] += drift * drift;
-    }
-    let information = covariance.try_inverse().unwrap_or_else(Matrix6::identity);
-    (information + information.transpose()) * 0.5
 }

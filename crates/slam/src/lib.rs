@@ -7,4 +7,5 @@ pub mod agent;
 pub mod log;
 pub mod loop_closure;
 pub mod mapping;
+mod odometry;
 pub mod tracking;

@@ -189,10 +189,15 @@ impl Knowledge {
                     key.agent, key.epoch.0, key.sequence
                 );
                 error!("{text}");
-                if !self.warnings.contains(&text) {
-                    self.warnings.push(text);
-                }
+                self.warn_once(text);
             }
+        }
+    }
+
+    /// Users are told something, once.
+    pub fn warn_once(&mut self, text: String) {
+        if !self.warnings.contains(&text) {
+            self.warnings.push(text);
         }
     }
 

@@ -32,7 +32,8 @@ fn graph_name(name: String) -> Result<String, FieldError> {
 }
 
 fn full(graph: &str, Full { what, limit }: Full) -> Status {
-    Status::resource_exhausted(format!("graph {graph:?} is full: {what} = {limit}"))
+    let graph = format!("graph {graph:?}");
+    coma_wire::full(&graph, &format!("{graph} is full: {what} = {limit}"))
 }
 
 fn lacking(graph: &str, Lacking { life: (agent, epoch), have, needed, forked_at }: Lacking) -> Status {

@@ -273,6 +273,7 @@ async fn graphs_are_bounded_and_the_least_recently_used_one_makes_room() {
     let request = v1::PutEntriesRequest { graph: "x".into(), entries: all(&[&a]) };
     let status = client.put_entries(request).await.unwrap_err();
     assert_eq!(status.code(), Code::ResourceExhausted);
+    assert!(coma_wire::is_full(&status), "waiting would not help: {status:?}");
     assert!(status.message().contains("max_facts_per_graph = 12"), "{status}");
     let short = Log::walk("a", 100, 3);
     for graph in ["x", "y"] {

@@ -29,6 +29,9 @@ pub struct PlaceRecognitionConfig {
     /// Anchors in one index; more are refused. One takes about 1 KiB with the builtin descriptor, 10 KiB
     /// at most. Default: 20000.
     pub max_anchors_per_index: usize,
+    /// Approximate search instead of exact, for indices of some 10^5 anchors and more: needs a program that was built
+    /// with the feature `usearch`. Default: false.
+    pub approximate: bool,
     /// Pixels of a picture; larger ones are refused. Default: 3840 x 2160.
     pub max_pixels: usize,
     /// Pictures that are decoded and encoded at once; none: one per core. Others wait.
@@ -71,6 +74,7 @@ impl Default for PlaceRecognitionConfig {
             candidates: coma_place::Settings::default(),
             max_indices: 64,
             max_anchors_per_index: 20_000,
+            approximate: false,
             max_pixels: 3840 * 2160,
             threads: None,
         }
@@ -84,9 +88,13 @@ impl PlaceRecognitionConfig {
             ensure!((low..=high).contains(&value), "{name} = {value} must be {low} to {high}");
             Ok(())
         };
+        ensure!(
+            !self.approximate || cfg!(feature = "usearch"),
+            "approximate = true: this program was built without the feature `usearch`"
+        );
         within("models", self.models.len(), 0, MAX_MODELS)?;
         within("onnx.threads", self.onnx.threads, 1, 256)?;
-        within("candidates.window", self.candidates.window as usize, 0, 16)?;
+        within("candidates.window_frames", self.candidates.window_frames as usize, 0, 1000)?;
         within("candidates.nearest", self.candidates.nearest, 1, 1000)?;
         within("max_indices", self.max_indices, 1, 10_000)?;
         within("max_anchors_per_index", self.max_anchors_per_index, 1, 10_000_000)?;

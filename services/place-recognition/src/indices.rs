@@ -1,5 +1,6 @@
 //! The anchors of every caller, in bounded numbers.
 
+use crate::config::PlaceRecognitionConfig;
 use coma_geometry::{AgentId, SubmapId};
 use coma_place::{Candidate, Candidates, Descriptor, Settings, Space, Thresholds};
 use std::collections::{BTreeMap, BTreeSet};
@@ -95,18 +96,32 @@ pub struct Indices {
     thresholds: BTreeMap<Space, Thresholds>,
     max_indices: usize,
     max_anchors: usize,
+    approximate: bool,
     shelf: Mutex<Shelf>,
 }
 
 impl Indices {
     /// None yet.
-    pub fn new(
-        settings: Settings,
-        thresholds: BTreeMap<Space, Thresholds>,
-        max_indices: usize,
-        max_anchors: usize,
-    ) -> Self {
-        Indices { settings, thresholds, max_indices, max_anchors, shelf: Mutex::default() }
+    pub fn new(config: &PlaceRecognitionConfig, thresholds: BTreeMap<Space, Thresholds>) -> Self {
+        Indices {
+            settings: config.candidates,
+            thresholds,
+            max_indices: config.max_indices,
+            max_anchors: config.max_anchors_per_index,
+            approximate: config.approximate,
+            shelf: Mutex::default(),
+        }
+    }
+
+    fn empty(&self) -> Candidates {
+        #[cfg(feature = "usearch")]
+        if self.approximate {
+            let index = Box::new(coma_place::LargeIndex::default());
+            return Candidates::with_index(self.settings, self.thresholds.clone(), index);
+        }
+        // Without the feature the setting was refused.
+        debug_assert!(!self.approximate);
+        Candidates::new(self.settings, self.thresholds.clone())
     }
 
     fn lock(&self) -> MutexGuard<'_, Shelf> {
@@ -142,7 +157,7 @@ impl Indices {
             indices.remove(&oldest);
         }
         let index = Arc::new(RwLock::new(PlaceIndex {
-            candidates: Candidates::new(self.settings, self.thresholds.clone()),
+            candidates: self.empty(),
             comparable: self.thresholds.keys().cloned().collect(),
             spaces: BTreeMap::new(),
             max_anchors: self.max_anchors,

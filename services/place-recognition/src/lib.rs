@@ -59,12 +59,7 @@ impl Server {
             tokio::task::spawn_blocking(move || Encoders::load(&config))
         };
         let encoders = Arc::new(loading.await.context("models could not be loaded")?);
-        let indices = Arc::new(Indices::new(
-            config.candidates,
-            encoders.thresholds(),
-            config.max_indices,
-            config.max_anchors_per_index,
-        ));
+        let indices = Arc::new(Indices::new(&config, encoders.thresholds()));
         let service = PlaceService { encoders, indices, work, max_pixels: config.max_pixels };
         let services = Services::new().with(PlaceRecognitionServer::new(service).limited(limit));
         let ledger = ByteLedger::default();

@@ -133,10 +133,12 @@ impl PlaceRecognition for PlaceService {
                 let inserted = index.write().unwrap_or_else(PoisonError::into_inner).insert(anchors);
                 metrics::gauge!("coma_place_anchors").set(indices.anchors() as f64);
                 inserted.map_err(|Full { held, new }| {
-                    Status::resource_exhausted(format!(
-                        "index {name:?} holds {held} anchors and has no room for {new} more \
+                    let index = format!("index {name:?}");
+                    let message = format!(
+                        "{index} is full: it holds {held} anchors and has no room for {new} more \
                          (setting max_anchors_per_index)"
-                    ))
+                    );
+                    coma_wire::full(&index, &message)
                 })
             })
             .await?;

@@ -214,6 +214,7 @@ async fn indices_are_bounded_and_a_caller_whose_index_went_inserts_again() {
     }
     let status = client.insert(insert("y", vec![one(2), one(3)])).await.unwrap_err();
     assert_eq!(status.code(), Code::ResourceExhausted);
+    assert!(coma_wire::is_full(&status), "waiting would not help: {status:?}");
     assert!(status.message().contains("max_anchors_per_index"), "{status}");
     let held = client.insert(insert("y", vec![one(2)])).await.unwrap().into_inner().anchors_in_index;
     assert_eq!(held, 3, "what fits is taken later");
@@ -337,10 +338,14 @@ async fn settings_out_of_range_are_named() {
         Err(e) => e.to_string(),
     };
     let mut config = PlaceRecognitionConfig::default();
-    config.candidates.window = u32::MAX;
-    assert!(refused(config).await.starts_with("candidates.window = 4294967295"));
+    config.candidates.window_frames = 1001;
+    assert!(refused(config).await.starts_with("candidates.window_frames = 1001"));
     let config = PlaceRecognitionConfig { models: vec!["m".into(); 8], ..Default::default() };
     assert!(refused(config).await.starts_with("models = 8"));
+    if cfg!(not(feature = "usearch")) {
+        let config = PlaceRecognitionConfig { approximate: true, ..Default::default() };
+        assert!(refused(config).await.contains("without the feature `usearch`"));
+    }
 }
 
 #[tokio::test]

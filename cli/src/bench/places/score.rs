@@ -25,7 +25,7 @@ pub struct Scores {
     pub average_precision: f64,
     /// Share of the matches scored above every pair that shares less than 10 %.
     pub recall_without_false: f64,
-    /// The same by the mean similarity over all pairs of both windows.
+    /// The same by the mean similarity of the frames of both windows with their best counterparts.
     pub window_recall_without_false: f64,
     /// Share of the perturbed views whose best candidate lies within 12 frames of the original.
     pub perturbed_hit: f64,
@@ -46,7 +46,7 @@ pub struct Known<'a> {
     pub ids: &'a [usize],
     /// Frames nearer than this many are no pair.
     pub gap: usize,
-    /// Frames to either side that belong to a window.
+    /// Frames this near belong to a frame's window.
     pub window: usize,
     /// True overlap, `[frame, frame]`.
     pub overlap: &'a [Vec<f64>],
@@ -114,11 +114,41 @@ impl Known<'_> {
         Passed { matches: share(&|overlap| overlap >= SAME), others: share(&|overlap| overlap < OTHER) }
     }
 
-    /// Mean over all pairs of the two windows.
+    /// Thresholds that let 97 % of the matches of this sequence pass: recall first, registration decides. `None`
+    /// without matches.
+    pub fn proposed(&self) -> Option<Thresholds> {
+        /// Share of the matches that each of the two may hold back.
+        const HELD_BACK: f64 = 0.015;
+        let n = self.ids.len();
+        let pairs = (0..n).flat_map(|i| (i + 1..n).map(move |j| (i, j)));
+        let matches: Vec<(usize, usize)> = pairs
+            .filter(|(i, j)| self.ids[*i].abs_diff(self.ids[*j]) > self.gap && self.overlap[*i][*j] >= SAME)
+            .collect();
+        let low = |score: &dyn Fn(usize, usize) -> f32| {
+            let mut scores: Vec<f32> = matches.iter().map(|(i, j)| score(*i, *j)).collect();
+            scores.sort_by(f32::total_cmp);
+            // Rounded down: thresholds are exceeded, not met.
+            let score = scores.get((scores.len() as f64 * HELD_BACK) as usize)?;
+            Some((score * 100.0 - 1e-3).floor() / 100.0)
+        };
+        Some(Thresholds {
+            theta_sim: low(&|i, j| self.similarity[i][j])?,
+            theta_multi: low(&|i, j| self.window_similarity(i, j))?,
+        })
+    }
+
+    /// As candidates are verified: each frame of a window with its best counterpart in the other, on average.
     fn window_similarity(&self, i: usize, j: usize) -> f32 {
-        let around = |k: usize| k.saturating_sub(self.window)..(k + self.window + 1).min(self.ids.len());
-        let all: Vec<f32> = around(i).flat_map(|a| around(j).map(move |b| self.similarity[a][b])).collect();
-        all.iter().sum::<f32>() / all.len() as f32
+        let near =
+            |k: usize| (0..self.ids.len()).filter(move |l| self.ids[*l].abs_diff(self.ids[k]) <= self.window);
+        let far = |a: usize, b: usize| self.ids[a].abs_diff(self.ids[b]) > self.gap;
+        let mean = |from: usize, into: usize| {
+            let best =
+                |a: usize| near(into).filter(|b| far(a, *b)).map(|b| self.similarity[a][b]).reduce(f32::max);
+            let all: Vec<f32> = near(from).filter_map(best).collect();
+            all.iter().sum::<f32>() / all.len() as f32
+        };
+        0.5 * (mean(i, j) + mean(j, i))
     }
 }
 
@@ -178,5 +208,9 @@ mod tests {
             (1.0, 1.0, 1.0)
         );
         assert_eq!(scores.perturbed_hit, 0.5);
+        let proposed = known.proposed().unwrap();
+        assert_eq!((proposed.theta_sim, proposed.theta_multi), (0.49, 0.49), "just below the only match");
+        let passed = known.passed(proposed);
+        assert_eq!((passed.matches, passed.others), (1.0, 0.0));
     }
 }

@@ -145,3 +145,55 @@ fn only_an_author_withdraws_its_verdict() {
     closer.on_entry(&key("a", 10), &Payload::LoopWithdrawn(withdraw));
     assert_eq!(closer.decided().count(), 0);
 }
+
+fn described(submap: &SubmapId) -> Payload {
+    let evidence = crate::log::Evidence { hash: [0; 32], size_bytes: 1 };
+    Payload::AnchorDescribed(AnchorDescribed {
+        submap: submap.clone(),
+        descriptors: Vec::new(),
+        coarse: evidence,
+        full: evidence,
+    })
+}
+
+#[test]
+fn an_anchor_is_looked_up_again_when_its_window_grows() {
+    // 20 frames apart: a window of 25 holds the neighbours only.
+    let ids: Vec<SubmapId> = (0..4).map(|n| submap("a", n)).collect();
+    let mut closer = closer_with(&ids);
+    let mut next = 4;
+    let mut describe = |closer: &mut LoopCloser, n: usize| {
+        closer.on_entry(&key("a", next), &described(&ids[n]));
+        next += 1;
+        closer.take_inserts();
+        closer.take_queries().iter().map(|id| id.number).collect::<Vec<_>>()
+    };
+    assert_eq!(describe(&mut closer, 0), [0]);
+    assert_eq!(describe(&mut closer, 1), [0, 1]);
+    assert_eq!(describe(&mut closer, 3), [3], "2 is not described yet, 1 is too far");
+    assert_eq!(describe(&mut closer, 2), [1, 2, 3]);
+}
+
+#[test]
+fn a_candidate_that_waits_takes_the_similarity_of_the_wider_window() {
+    let (x, y) = (submap("a", 0), submap("a", 5));
+    let mut closer = closer_with(&[x.clone(), y.clone()]);
+    closer.on_candidates(vec![candidate(&x, &y, 0.7)], 0.0);
+    closer.on_candidates(vec![candidate(&x, &y, 0.9)], 1.0);
+    assert_eq!(closer.pending(), 1);
+    assert_eq!(closer.next_to_verify(|_| true, 1.0).unwrap().window_similarity, 0.9);
+}
+
+#[test]
+fn anchors_without_room_are_left_alone_until_place_recognition_starts_anew() {
+    let ids: Vec<SubmapId> = (0..2).map(|n| submap("a", n)).collect();
+    let mut closer = closer_with(&ids);
+    closer.on_entry(&key("a", 2), &described(&ids[0]));
+    closer.on_entry(&key("a", 3), &described(&ids[1]));
+    assert_eq!(closer.take_inserts(), ids);
+    closer.set_aside(vec![ids[1].clone()]);
+    assert_eq!(closer.take_queries(), ids[..1]);
+    assert_eq!((closer.inserted(), closer.unqueried()), (1, 0));
+    closer.insert_all_again();
+    assert_eq!(closer.take_inserts(), ids);
+}

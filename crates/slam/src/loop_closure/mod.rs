@@ -19,6 +19,10 @@ pub struct LoopSettings {
     pub enabled: bool,
     /// Candidates that are asked for per anchor.
     pub candidates_per_anchor: u32,
+    /// An anchor is looked up again when another one of its life, at most this many frames before or after it, is
+    /// described: its window, by which place recognition rates candidates, is wider then. As place recognition's
+    /// `candidates.window_frames`.
+    pub window_frames: u64,
     /// Without a verdict for so long, seconds, the other end verifies.
     pub takeover_s: f64,
     /// Evidence that nobody held is asked for again after so long, seconds.
@@ -27,7 +31,13 @@ pub struct LoopSettings {
 
 impl Default for LoopSettings {
     fn default() -> Self {
-        LoopSettings { enabled: true, candidates_per_anchor: 6, takeover_s: 10.0, retry_s: 5.0 }
+        LoopSettings {
+            enabled: true,
+            candidates_per_anchor: 6,
+            window_frames: 25,
+            takeover_s: 10.0,
+            retry_s: 5.0,
+        }
     }
 }
 
@@ -104,6 +114,8 @@ pub struct LoopCloser {
     waiting: BTreeMap<Pair, Waiting>,
     to_query: BTreeSet<SubmapId>,
     to_insert: BTreeSet<SubmapId>,
+    /// Anchors for which place recognition has no room.
+    no_room: BTreeSet<SubmapId>,
     graph_changed: bool,
 }
 
@@ -119,6 +131,7 @@ impl LoopCloser {
             waiting: BTreeMap::new(),
             to_query: BTreeSet::new(),
             to_insert: BTreeSet::new(),
+            no_room: BTreeSet::new(),
             graph_changed: false,
         }
     }
@@ -136,6 +149,8 @@ impl LoopCloser {
                     facts.anchor = Some(anchor.clone());
                     self.to_insert.insert(anchor.submap.clone());
                     self.to_query.insert(anchor.submap.clone());
+                    let wider = self.window_of(&anchor.submap);
+                    self.to_query.extend(wider);
                 }
             }
             Payload::LoopVerdict(verdict) => {
@@ -153,6 +168,20 @@ impl LoopCloser {
         }
     }
 
+    /// Described anchors of the same life around a submap's, which it widens the windows of.
+    fn window_of(&self, id: &SubmapId) -> Vec<SubmapId> {
+        let Some(own) = self.submaps.get(id) else { return Vec::new() };
+        let near = |(other, facts): &(&SubmapId, &SubmapFacts)| {
+            other.agent == id.agent
+                && other.epoch == id.epoch
+                && facts.opened.anchor_frame.abs_diff(own.opened.anchor_frame) <= self.settings.window_frames
+        };
+        let before = self.submaps.range(..id).rev().take_while(near);
+        let after = self.submaps.range(id..).skip(1).take_while(near);
+        let described = before.chain(after).filter(|(_, facts)| facts.anchor.is_some());
+        described.map(|(other, _)| other.clone()).collect()
+    }
+
     /// Anchors that place recognition should learn; the caller reports back by asking again.
     pub fn take_inserts(&mut self) -> Vec<SubmapId> {
         std::mem::take(&mut self.to_insert).into_iter().collect()
@@ -161,7 +190,8 @@ impl LoopCloser {
     /// Anchors to look up, after they were inserted.
     pub fn take_queries(&mut self) -> Vec<SubmapId> {
         let queries = std::mem::take(&mut self.to_query);
-        if self.settings.enabled { queries.into_iter().collect() } else { Vec::new() }
+        let known = queries.into_iter().filter(|id| !self.no_room.contains(id));
+        if self.settings.enabled { known.collect() } else { Vec::new() }
     }
 
     /// Puts back what could not be done.
@@ -170,15 +200,25 @@ impl LoopCloser {
         self.to_query.extend(queries);
     }
 
+    /// Place recognition has no room for these: they are neither inserted nor looked up until it starts anew.
+    pub fn set_aside(&mut self, submaps: Vec<SubmapId>) {
+        for id in submaps {
+            self.to_query.remove(&id);
+            self.no_room.insert(id);
+        }
+    }
+
     /// Place recognition lost what it had: every anchor is inserted again.
     pub fn insert_all_again(&mut self) {
+        self.no_room.clear();
         let described = self.submaps.iter().filter(|(_, facts)| facts.anchor.is_some());
         self.to_insert.extend(described.map(|(id, _)| id.clone()));
     }
 
     /// Anchors that were handed out to be inserted.
     pub fn inserted(&self) -> usize {
-        self.submaps.values().filter(|facts| facts.anchor.is_some()).count() - self.to_insert.len()
+        let described = self.submaps.values().filter(|facts| facts.anchor.is_some()).count();
+        described - self.to_insert.len() - self.no_room.len()
     }
 
     /// Takes candidates; keeps those that have an end here and no verdict.
@@ -188,8 +228,15 @@ impl LoopCloser {
             let mine = pair.from.agent == self.own || pair.to.agent == self.own;
             let known = self.submaps.contains_key(&pair.from) && self.submaps.contains_key(&pair.to);
             if mine && known && !self.verdicts.contains_key(pair) {
-                let waiting = Waiting { candidate, since_s: now_s, not_before_s: now_s, in_work: false };
-                self.waiting.entry(waiting.candidate.pair.clone()).or_insert(waiting);
+                let pair = pair.clone();
+                // One that waits already keeps its turn, and takes the similarity of the wider window.
+                let waiting = self.waiting.entry(pair).or_insert_with(|| Waiting {
+                    candidate: candidate.clone(),
+                    since_s: now_s,
+                    not_before_s: now_s,
+                    in_work: false,
+                });
+                waiting.candidate = candidate;
             }
         }
     }

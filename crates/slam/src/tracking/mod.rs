@@ -73,8 +73,8 @@ impl Default for TrackingSettings {
             min_depth_share: 0.05,
             max_step_m: 0.5,
             max_step_rad: 0.6,
-            floor_m: 0.002,
-            floor_rad: 0.1f64.to_radians(),
+            floor_m: 0.0005,
+            floor_rad: 0.02f64.to_radians(),
         }
     }
 }

@@ -20,6 +20,8 @@ use tracing::{debug, warn};
 
 /// How long to wait before a service that failed is asked again.
 const RETRY: Duration = Duration::from_millis(500);
+/// Anchors in one Insert.
+const ANCHORS_PER_CALL: usize = 256;
 
 type Client = PlaceRecognitionClient<Channel>;
 
@@ -140,15 +142,45 @@ async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyho
         (knowledge.agent.to_string(), submaps.iter().filter_map(anchor).collect::<Vec<_>>())
     };
     let mut held = None;
-    for chunk in anchors.chunks(256) {
+    let mut rest: &[v1::Anchor] = &anchors;
+    let mut together = ANCHORS_PER_CALL;
+    while !rest.is_empty() {
+        let (chunk, after) = rest.split_at(together.min(rest.len()));
         let request = v1::InsertRequest { index: index.clone(), anchors: chunk.to_vec() };
-        held = Some(client.insert(request).await?.into_inner().anchors_in_index);
+        match client.insert(request).await {
+            Ok(response) => {
+                held = Some(response.into_inner().anchors_in_index);
+                rest = after;
+            }
+            // All or none of a call: one by one, as many as there is room for.
+            Err(status) if coma_wire::is_full(&status) && chunk.len() > 1 => together = 1,
+            Err(status) if coma_wire::is_full(&status) => {
+                set_aside(node, rest, status.message())?;
+                break;
+            }
+            Err(status) => return Err(status.into()),
+        }
     }
     let mut knowledge = node.lock();
     if held.is_some_and(|held| held < knowledge.closer.inserted() as u64) {
         debug!(held, "place recognition started anew: it is given all anchors again");
         knowledge.closer.insert_all_again();
     }
+    Ok(())
+}
+
+/// Place recognition has no room for these anchors: users are told, and the agent goes on without them.
+fn set_aside(node: &Node, anchors: &[v1::Anchor], message: &str) -> anyhow::Result<()> {
+    let at = At::Root("anchors");
+    let read = |a: &v1::Anchor| at.field("submap_id").required(a.submap_id.clone());
+    let submaps = anchors.iter().map(read).collect::<Result<Vec<SubmapId>, _>>()?;
+    warn!(
+        anchors = submaps.len(),
+        message, "place recognition has no room: these places can't be recognised"
+    );
+    let mut knowledge = node.lock();
+    knowledge.closer.set_aside(submaps);
+    knowledge.warn_once(format!("{message}: new places are no longer recognised"));
     Ok(())
 }
 
@@ -174,9 +206,7 @@ async fn query(node: &Node, client: &mut Client, submap: &SubmapId) -> anyhow::R
     let mut knowledge = node.lock();
     for agent in response.agents_without_common_space {
         let text = format!("{agent} describes places in no space that this agent knows: no loops with it");
-        if !knowledge.warnings.contains(&text) {
-            knowledge.warnings.push(text);
-        }
+        knowledge.warn_once(text);
     }
     knowledge.closer.on_candidates(candidates, now_s);
     Ok(())

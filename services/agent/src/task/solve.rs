@@ -40,6 +40,14 @@ pub async fn run(node: Arc<Node>, mut client: DpgoClient<Channel>) {
         let mut failed = false;
         while let Err(e) = solve(&node, &mut client, &mut given).await {
             let error = format!("{e:#}");
+            if let Some(status) = e.downcast_ref::<tonic::Status>().filter(|s| coma_wire::is_full(s)) {
+                // Asked again when there is more to solve: by then it may have been given more room.
+                warn!(error, "the graph has no room for what is new");
+                let text = format!("{}: the map is no longer corrected", status.message());
+                node.lock().warn_once(text);
+                given.have.clear();
+                break;
+            }
             if failed {
                 debug!(error, "the graph could not be solved yet");
             } else {
