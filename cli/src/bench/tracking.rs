@@ -179,7 +179,7 @@ fn one(source: Source, settings: &SlamSettings, arguments: &Arguments) -> anyhow
 }
 
 /// RMS and largest distance after rigid alignment, and RMS of the error of one step, metres.
-fn score(found: &[(usize, Pose)], truth: impl Fn(usize) -> Option<Pose>) -> Option<(f64, f64, f64)> {
+pub(super) fn score(found: &[(usize, Pose)], truth: impl Fn(usize) -> Option<Pose>) -> Option<(f64, f64, f64)> {
     let pairs: Vec<(usize, Pose, Pose)> =
         found.iter().filter_map(|(i, p)| Some((*i, *p, truth(*i)?))).collect();
     let points = |f: fn(&(usize, Pose, Pose)) -> Pose| -> Vec<_> {

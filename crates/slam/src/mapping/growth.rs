@@ -16,8 +16,6 @@ pub enum GrowthRule {
     /// The pixel is not covered, or the observation lies in front of the rendering by more than 50 times the median
     /// depth error (Keetha et al. 2024, "SplaTAM").
     Usual,
-    /// Every pixel, whatever the map knows.
-    Everywhere,
 }
 
 /// Depth errors of so many medians are a new surface, by the usual rule.
@@ -43,7 +41,7 @@ impl<'a> NewPixels<'a> {
     ) -> Self {
         let in_front_m = match rule {
             GrowthRule::Usual => DEPTH_MEDIANS * median_error_m(&rendering.depth_m, observed_depth_m),
-            GrowthRule::Adaptive | GrowthRule::Everywhere => f32::INFINITY,
+            GrowthRule::Adaptive => f32::INFINITY,
         };
         NewPixels { rule, rendering, observed_depth_m, covered_opacity, in_front_m }
     }
@@ -61,7 +59,6 @@ impl<'a> NewPixels<'a> {
                 let before_m = self.rendering.depth_m[(x, y)] - self.observed_depth_m[(x, y)];
                 !covered || before_m > self.in_front_m
             }
-            GrowthRule::Everywhere => true,
         }
     }
 }
@@ -113,7 +110,6 @@ mod tests {
         for rule in [GrowthRule::Adaptive, GrowthRule::Usual] {
             assert_eq!(new(rule, &seen, &[(5, 12), (28, 12)]), [false, true], "{rule:?}");
         }
-        assert_eq!(new(GrowthRule::Everywhere, &seen, &[(5, 12), (28, 12)]), [true, true]);
     }
 
     #[test]

@@ -38,7 +38,7 @@ pub struct MappingSettings {
     pub moved_m: f64,
     /// ... or turned so far, radians.
     pub moved_rad: f64,
-    /// Where the map grows: `adaptive`, `usual` or `everywhere`.
+    /// Where the map grows: `adaptive` or `usual`.
     pub growth: GrowthRule,
     /// Eq. 5: a blended surfel within so many sigma(z) of the observed depth is the same surface ...
     pub growth_sigma: f32,
