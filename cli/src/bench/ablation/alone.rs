@@ -1,11 +1,13 @@
 //! One variant: each agent alone, from its first frame to its rendered map.
 
+use super::gaussians;
 use super::variant::Variant;
 use crate::bench::cpu::process_ms;
 use crate::bench::tracking;
 use crate::progress;
 use crate::source::{self, Source};
 use coma_evaluation::{FrameScore, View, score_frame};
+use coma_frame::{Image, RgbdFrame};
 use coma_geometry::{AgentId, Epoch, Pose, SubmapId};
 use coma_raster::{Outputs, RenderSettings, SubmapView, render_only};
 use coma_slam::agent::{Agent, Event, FrameOptions, SlamSettings};
@@ -46,7 +48,7 @@ pub struct Spent {
 
 impl Spent {
     /// Does some work and adds its time.
-    fn on<T>(&mut self, work: impl FnOnce() -> T) -> T {
+    pub fn on<T>(&mut self, work: impl FnOnce() -> T) -> T {
         let (begin, before_ms) = (Instant::now(), process_ms());
         let result = work();
         self.processor_ms += process_ms() - before_ms;
@@ -63,7 +65,11 @@ pub fn run(
     views: usize,
 ) -> anyhow::Result<Vec<Figures>> {
     let settings = variant.settings(shared);
-    source::open(specs)?.into_iter().map(|source| one(variant, &source, &settings, views)).collect()
+    let one = |source: Source| match variant {
+        Variant::Gaussians => gaussians::one(&source, &settings, views),
+        _ => one(variant, &source, &settings, views),
+    };
+    source::open(specs)?.into_iter().map(one).collect()
 }
 
 fn one(
@@ -89,12 +95,10 @@ fn one(
     submaps.take(agent.finish());
     bar.finish_and_clear();
     let merged = submaps.merged();
-    let enough = found.len() as f64 >= coma_evaluation::LEAST_COVERAGE * sequence.len() as f64;
-    let score = tracking::score(&found, |index| sequence.truth(index)).filter(|_| enough);
     Ok(Figures {
         frames: sequence.len(),
         posed: found.len(),
-        ate_m: score.map(|(rmse_m, ..)| rmse_m),
+        ate_m: tracking::ate_m(&found, sequence),
         views: compare(source, &found, &merged, &settings.render, views)?,
         surfels: submaps.closed.values().map(|(surfels, _)| surfels.len()).sum(),
         merged: merged.len(),
@@ -145,16 +149,37 @@ fn compare(
     render: &RenderSettings,
     views: usize,
 ) -> anyhow::Result<Vec<FrameScore>> {
-    let views = views.min(found.len());
-    let mut out = Vec::with_capacity(views);
-    for k in 0..views {
-        let (index, agent_from_camera) = found[(2 * k + 1) * found.len() / (2 * views)];
+    let mut out = Compared::default();
+    for (index, agent_from_camera) in picked(found, views) {
         let frame = coma_dataset::sequence::rgbd_frame(&*source.sequence, index)?;
         let view = SubmapView { surfels: map, camera_from_submap: agent_from_camera.inverse() };
         let rendering = render_only(&[view], &frame.camera, render, None, Outputs::OPTIMISING);
-        let recorded = frame.color.to_unit();
-        let rendered = View { color: &rendering.color, depth_m: &rendering.depth_m };
-        out.push(score_frame(rendered, View { color: &recorded, depth_m: &frame.depth_m }, None)?);
+        out.add(&rendering.color, &rendering.depth_m, &frame)?;
     }
-    Ok(out)
+    Ok(out.0)
+}
+
+/// At most `views` of the poses, evenly spread.
+pub fn picked(found: &[(usize, Pose)], views: usize) -> impl Iterator<Item = (usize, Pose)> {
+    let views = views.min(found.len());
+    (0..views).map(move |k| found[(2 * k + 1) * found.len() / (2 * views)])
+}
+
+/// Rendered views against recorded ones.
+#[derive(Default)]
+pub struct Compared(pub Vec<FrameScore>);
+
+impl Compared {
+    /// Adds one.
+    pub fn add(
+        &mut self,
+        color: &Image<[f32; 3]>,
+        depth_m: &Image<f32>,
+        frame: &RgbdFrame,
+    ) -> anyhow::Result<()> {
+        let recorded = frame.color.to_unit();
+        let truth = View { color: &recorded, depth_m: &frame.depth_m };
+        self.0.push(score_frame(View { color, depth_m }, truth, None)?);
+        Ok(())
+    }
 }

@@ -2,6 +2,7 @@
 
 mod alone;
 mod cluster;
+mod gaussians;
 mod show;
 mod variant;
 

@@ -13,6 +13,8 @@ use serde::Serialize;
 pub enum Variant {
     /// Everything as it is.
     Ours,
+    /// 3D Gaussians in place of surfels.
+    Gaussians,
     /// Surfels turned at random when they are made, with the mean of their two scales.
     Unfitted,
     /// The usual rule of growth.
@@ -27,13 +29,20 @@ pub enum Variant {
 
 impl Variant {
     /// Those that need no peers.
-    pub const ALONE: [Variant; 5] =
-        [Variant::Ours, Variant::Unfitted, Variant::UsualGrowth, Variant::Unfused, Variant::Adam];
+    pub const ALONE: [Variant; 6] = [
+        Variant::Ours,
+        Variant::Gaussians,
+        Variant::Unfitted,
+        Variant::UsualGrowth,
+        Variant::Unfused,
+        Variant::Adam,
+    ];
 
     /// For readers.
     pub fn name(self) -> &'static str {
         match self {
             Variant::Ours => "ours",
+            Variant::Gaussians => "without surfels (3D Gaussians)",
             Variant::Unfitted => "without surface-fitting initialisation",
             Variant::UsualGrowth => "without adaptive growing",
             Variant::Unfused => "without fusion and inheritance",
@@ -46,6 +55,10 @@ impl Variant {
     pub fn change(self) -> &'static str {
         match self {
             Variant::Ours => "the settings as they are",
+            Variant::Gaussians => {
+                "balls of the seeds' size in place of discs, through EWA splatting with gradients of its own; no \
+                 fusion or inheritance, as balls have no normal; a plain path, whose times say nothing of 3D Gaussians"
+            }
             Variant::Unfitted => {
                 "random rotation and the mean of the two scales; the optimiser may then turn surfels \
                  (0.02 rad a step)"
@@ -64,7 +77,8 @@ impl Variant {
     pub fn settings(self, shared: &SlamSettings) -> SlamSettings {
         let mut settings = shared.clone();
         match self {
-            Variant::Ours | Variant::NoLoops => {}
+            // Gaussians have an agent of their own, which takes what is shared.
+            Variant::Ours | Variant::Gaussians | Variant::NoLoops => {}
             Variant::Unfitted => {
                 settings.mapping.seed.fit = Fit::Random;
                 settings.mapping.optimise.rotation_rate_rad = 0.02;
@@ -87,10 +101,11 @@ mod tests {
     #[test]
     fn every_variant_but_ours_changes_the_settings_and_none_like_another() {
         let shared = SlamSettings::default();
-        let all: Vec<SlamSettings> = Variant::ALONE.iter().map(|v| v.settings(&shared)).collect();
+        let with_surfels = Variant::ALONE.iter().filter(|v| **v != Variant::Gaussians);
+        let all: Vec<SlamSettings> = with_surfels.map(|v| v.settings(&shared)).collect();
         assert_eq!(all[0], shared);
         for (i, a) in all.iter().enumerate() {
-            assert!(all[..i].iter().all(|b| a != b), "{:?}", Variant::ALONE[i]);
+            assert!(all[..i].iter().all(|b| a != b), "row {i}");
         }
     }
 }

@@ -3,6 +3,7 @@
 use crate::tracking::adam::median;
 use coma_frame::Image;
 use coma_raster::Rendering;
+use coma_raster::ewa::Picture;
 use serde::{Deserialize, Serialize};
 
 /// Which pixels become surfels.
@@ -21,10 +22,33 @@ pub enum GrowthRule {
 /// Depth errors of so many medians are a new surface, by the usual rule.
 const DEPTH_MEDIANS: f32 = 50.0;
 
+/// What the map shows of a frame, with the growth test on the frame's depth. `[height, width]`
+#[derive(Clone, Copy, Debug)]
+pub struct Known<'a> {
+    /// Expected depth, metres.
+    pub depth_m: &'a Image<f32>,
+    /// A, 0..1.
+    pub opacity: &'a Image<f32>,
+    /// Something lies near the observed depth.
+    pub near_surface: Option<&'a Image<bool>>,
+}
+
+impl<'a> From<&'a Rendering> for Known<'a> {
+    fn from(r: &'a Rendering) -> Self {
+        Known { depth_m: &r.depth_m, opacity: &r.opacity, near_surface: r.near_surface.as_ref() }
+    }
+}
+
+impl<'a> From<&'a Picture> for Known<'a> {
+    fn from(p: &'a Picture) -> Self {
+        Known { depth_m: &p.depth_m, opacity: &p.opacity, near_surface: p.near_surface.as_ref() }
+    }
+}
+
 /// The pixels of one frame at which the map grows.
 pub struct NewPixels<'a> {
     rule: GrowthRule,
-    rendering: &'a Rendering,
+    known: Known<'a>,
     observed_depth_m: &'a Image<f32>,
     covered_opacity: f32,
     /// How far before the rendering a new surface lies, metres.
@@ -32,31 +56,32 @@ pub struct NewPixels<'a> {
 }
 
 impl<'a> NewPixels<'a> {
-    /// `rendering` is that of the map, with the growth test on `observed_depth_m`.
+    /// `known` is what the map shows, with the growth test on `observed_depth_m`.
     pub fn of(
         rule: GrowthRule,
-        rendering: &'a Rendering,
+        known: impl Into<Known<'a>>,
         observed_depth_m: &'a Image<f32>,
         covered_opacity: f32,
     ) -> Self {
+        let known = known.into();
         let in_front_m = match rule {
-            GrowthRule::Usual => DEPTH_MEDIANS * median_error_m(&rendering.depth_m, observed_depth_m),
+            GrowthRule::Usual => DEPTH_MEDIANS * median_error_m(known.depth_m, observed_depth_m),
             GrowthRule::Adaptive => f32::INFINITY,
         };
-        NewPixels { rule, rendering, observed_depth_m, covered_opacity, in_front_m }
+        NewPixels { rule, known, observed_depth_m, covered_opacity, in_front_m }
     }
 
     /// True where the map grows.
     pub fn holds(&self, x: usize, y: usize) -> bool {
-        let covered = self.rendering.opacity[(x, y)] >= self.covered_opacity;
+        let covered = self.known.opacity[(x, y)] >= self.covered_opacity;
         match self.rule {
             GrowthRule::Adaptive => {
                 // Eq. 5: no surfel near the observed depth, or the pixel is not covered.
-                let known = self.rendering.near_surface.as_ref().is_some_and(|near| near[(x, y)]);
+                let known = self.known.near_surface.is_some_and(|near| near[(x, y)]);
                 !known || !covered
             }
             GrowthRule::Usual => {
-                let before_m = self.rendering.depth_m[(x, y)] - self.observed_depth_m[(x, y)];
+                let before_m = self.known.depth_m[(x, y)] - self.observed_depth_m[(x, y)];
                 !covered || before_m > self.in_front_m
             }
         }
@@ -64,7 +89,7 @@ impl<'a> NewPixels<'a> {
 }
 
 /// Of the pixels with depth in both.
-pub(crate) fn median_error_m(rendered_m: &Image<f32>, observed_m: &Image<f32>) -> f32 {
+fn median_error_m(rendered_m: &Image<f32>, observed_m: &Image<f32>) -> f32 {
     let both = rendered_m.pixels().iter().zip(observed_m.pixels());
     let mut errors: Vec<f32> =
         both.filter(|(r, o)| **r > 0.0 && **o > 0.0).map(|(r, o)| (r - o).abs()).collect();

@@ -216,7 +216,7 @@ pub fn frame_to_model(
 }
 
 /// A pose with its certainty, or why it is none: it went too far from its guess, or fits too little.
-fn judged(
+pub(crate) fn judged(
     guess_agent_from_camera: &Pose,
     pose: &Pose,
     found: &Alignment,
