@@ -71,7 +71,8 @@ mod tests {
 
     #[test]
     fn every_figure_is_written_and_the_first_row_stands_out() {
-        let panel = BarPanel { title: "ATE, cm".into(), digits: 2, values: vec![Some(0.123), Some(4.0), None] };
+        let panel =
+            BarPanel { title: "ATE, cm".into(), digits: 2, values: vec![Some(0.123), Some(4.0), None] };
         let svg = bars_svg(&["ours", "less", "none"], &[panel]).unwrap();
         for text in ["ATE, cm", "ours", "less", "0.12", "4.00", "not measured"] {
             assert!(svg.contains(text), "{text}");

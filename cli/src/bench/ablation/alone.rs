@@ -72,12 +72,7 @@ pub fn run(
     source::open(specs)?.into_iter().map(one).collect()
 }
 
-fn one(
-    variant: Variant,
-    source: &Source,
-    settings: &SlamSettings,
-    views: usize,
-) -> anyhow::Result<Figures> {
+fn one(variant: Variant, source: &Source, settings: &SlamSettings, views: usize) -> anyhow::Result<Figures> {
     let sequence = &*source.sequence;
     let bar = progress::frames(&source.agent, sequence.len() as u64);
     bar.set_message(variant.name());

@@ -85,8 +85,13 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let wanted = |variant: Variant| {
         variant == Variant::Ours || arguments.rows.is_empty() || arguments.rows.contains(&variant)
     };
-    let mut ablation =
-        Ablation { specs: specs.clone(), frames: 0, views: arguments.views, alone: Vec::new(), cluster: Vec::new() };
+    let mut ablation = Ablation {
+        specs: specs.clone(),
+        frames: 0,
+        views: arguments.views,
+        alone: Vec::new(),
+        cluster: Vec::new(),
+    };
     for variant in Variant::ALONE.into_iter().filter(|variant| wanted(*variant)) {
         let agents = alone::run(variant, &specs, &settings, arguments.views)?;
         ablation.frames = agents.iter().map(|agent| agent.frames).sum();

@@ -143,7 +143,10 @@ mod tests {
     #[test]
     fn a_page_holds_every_row_and_no_folder_above_the_data() {
         let page = page(&ablation());
-        assert!(page.contains("| ours | 0.123 | 0 | 30.00 | 0.9500 | 0.400 | 1000 | 600 | 20 | 40 |"), "{page}");
+        assert!(
+            page.contains("| ours | 0.123 | 0 | 30.00 | 0.9500 | 0.400 | 1000 | 600 | 20 | 40 |"),
+            "{page}"
+        );
         assert!(page.contains("| without fusion and inheritance | not measured |"), "{page}");
         assert!(page.contains("`tum:living-room/agent-0[0:60]`") && !page.contains("/data"), "{page}");
         assert!(!page.contains("all agents together |"), "what was not run has no table");

@@ -1,8 +1,8 @@
 //! From derivatives by pixels to derivatives by the Gaussians' parameters and by the camera's pose.
 
+use super::GaussianView;
 use super::forward::{Picture, alpha, extent};
 use super::project::{InCamera, jacobian};
-use super::GaussianView;
 use crate::{ALPHA_MAX, PixelGradients, RenderSettings};
 use coma_geometry::{Intrinsics, Tangent};
 use nalgebra::{Matrix2, Matrix3, Vector2, Vector3};

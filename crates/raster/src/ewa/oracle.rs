@@ -41,7 +41,11 @@ pub fn in_camera(views: &[GaussianView<'_>]) -> Vec<OracleGaussian> {
 }
 
 /// Renders pixel by pixel, row by row; the surface depth is not made.
-pub fn render(gaussians: &[OracleGaussian], camera: &Intrinsics, settings: &RenderSettings) -> Vec<OraclePixel> {
+pub fn render(
+    gaussians: &[OracleGaussian],
+    camera: &Intrinsics,
+    settings: &RenderSettings,
+) -> Vec<OraclePixel> {
     let mut order: Vec<&OracleGaussian> = gaussians.iter().filter(|g| is_seen(g, camera, settings)).collect();
     order.sort_by(|a, b| a.center.z.total_cmp(&b.center.z));
     let pixels = (0..camera.height).flat_map(|y| (0..camera.width).map(move |x| (x as f64, y as f64)));

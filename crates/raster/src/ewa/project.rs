@@ -41,14 +41,7 @@ impl InCamera {
 pub(super) fn jacobian(center: &Vector3<f32>, camera: &Intrinsics) -> Matrix2x3<f32> {
     let (fx, fy) = (camera.fx as f32, camera.fy as f32);
     let inv = 1.0 / center.z;
-    Matrix2x3::new(
-        fx * inv,
-        0.0,
-        -fx * center.x * inv * inv,
-        0.0,
-        fy * inv,
-        -fy * center.y * inv * inv,
-    )
+    Matrix2x3::new(fx * inv, 0.0, -fx * center.x * inv * inv, 0.0, fy * inv, -fy * center.y * inv * inv)
 }
 
 /// A splat: alpha is `opacity exp(-q / 2)` with `q = d^T conic d`, `d` from the centre to the pixel.
@@ -66,7 +59,11 @@ pub(super) struct Splat {
 }
 
 /// Projects all Gaussians; those that are seen come from near to far.
-pub(super) fn splats(views: &[GaussianView<'_>], camera: &Intrinsics, settings: &RenderSettings) -> Vec<Splat> {
+pub(super) fn splats(
+    views: &[GaussianView<'_>],
+    camera: &Intrinsics,
+    settings: &RenderSettings,
+) -> Vec<Splat> {
     let mut out = Vec::new();
     let mut slot = 0;
     for view in views {

@@ -40,7 +40,14 @@ pub enum Fit {
 
 impl Default for SeedSettings {
     fn default() -> Self {
-        SeedSettings { spacing_px: 2, scale_in_spacings: 0.8, opacity: 0.95, max_stretch: 3.0, fit: Fit::Surface, random_seed: 1 }
+        SeedSettings {
+            spacing_px: 2,
+            scale_in_spacings: 0.8,
+            opacity: 0.95,
+            max_stretch: 3.0,
+            fit: Fit::Surface,
+            random_seed: 1,
+        }
     }
 }
 

@@ -118,7 +118,13 @@ pub(crate) fn median(values: &mut [f32]) -> f32 {
 }
 
 fn sign(value: f32) -> f32 {
-    if value > 0.0 { 1.0 } else if value < 0.0 { -1.0 } else { 0.0 }
+    if value > 0.0 {
+        1.0
+    } else if value < 0.0 {
+        -1.0
+    } else {
+        0.0
+    }
 }
 
 /// What Adam found.
@@ -213,7 +219,8 @@ pub fn frame_to_model(
     settings: &TrackingSettings,
 ) -> Result<Tracked, Vec<Reason>> {
     let not_aligned = || vec![Reason::NotAligned { with: "the map" }];
-    let refined = refine(model, frame, guess_agent_from_camera, brightness, &settings.adam).ok_or_else(not_aligned)?;
+    let refined =
+        refine(model, frame, guess_agent_from_camera, brightness, &settings.adam).ok_or_else(not_aligned)?;
     let pose = refined.agent_from_camera;
     let picture = model.picture(&pose, &frame.camera, view, settings);
     let still = AlignSettings { steps: vec![0], ..settings.frame_to_model.clone() };
