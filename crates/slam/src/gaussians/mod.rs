@@ -282,7 +282,10 @@ mod tests {
             let frame = rgbd_frame(&film, index).unwrap();
             let located = agent.locate(&frame);
             last = agent.take(&frame, located).expect("every frame is found");
-            eprintln!("{index} {:?}", se3::distance(&last, &film.truth(0).unwrap().inv_mul(&film.truth(index).unwrap())));
+            eprintln!(
+                "{index} {:?}",
+                se3::distance(&last, &film.truth(0).unwrap().inv_mul(&film.truth(index).unwrap()))
+            );
         }
         let truth = film.truth(0).unwrap().inv_mul(&film.truth(7).unwrap());
         let (metres, radians) = se3::distance(&last, &truth);
