@@ -7,9 +7,9 @@
 mod optimise;
 
 use crate::agent::SlamSettings;
-use crate::mapping::growth::NewPixels;
+use crate::mapping::growth::new_pixels;
 use crate::mapping::optimise::Target;
-use crate::mapping::seed::seed;
+use crate::mapping::seed::{SeedGrid, seed};
 use crate::mapping::submap::corrected_color;
 use crate::tracking::align::{Brightness, align};
 use crate::tracking::view::TrackingView;
@@ -98,8 +98,7 @@ impl GaussianAgent {
 
     /// Where is the camera? Changes nothing.
     pub fn locate(&self, frame: &RgbdFrame) -> Located {
-        let levels = self.settings.tracking.frame_to_frame.steps.len();
-        let view = TrackingView::from_frame(frame, levels);
+        let view = TrackingView::from_frame(frame, self.settings.tracking.levels());
         let tracked = self.active.as_ref().and_then(|_| self.track(frame, &view));
         Located { view, tracked }
     }
@@ -131,7 +130,8 @@ impl GaussianAgent {
         }
         let intensity = picture.color.map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]);
         let model = TrackingView::build(frame.camera, depth_m, intensity, view.noise, view.levels.len());
-        let found = align(&model, view, &Pose::identity(), self.brightness, &settings.frame_to_model)?;
+        let (model, view) = (model.coarser(settings.finest_level), view.coarser(settings.finest_level));
+        let found = align(&model, &view, &Pose::identity(), self.brightness, &settings.frame_to_model)?;
         let mut pose = guess * found.reference_from_camera;
         pose.rotation.renormalize();
         tracking::judged(&guess, &pose, &found, picture.hits, settings).ok()
@@ -214,9 +214,10 @@ impl Active {
             relative: mapping.growth_relative,
         };
         let picture = ewa::render(&views, &frame.camera, &settings.render, Some(&test));
-        let new = NewPixels::of(mapping.growth, &picture, &frame.depth_m, mapping.covered_opacity);
-        let is_new = |x: usize, y: usize| new.holds(x, y);
-        let seeds = seed(frame, &submap_from_camera, &mapping.seed, is_new, |x, y| color[(x, y)]);
+        let new = new_pixels(mapping.growth, &picture, &frame.depth_m, mapping.covered_opacity);
+        let grid = SeedGrid::of(&frame.camera, &mapping.seed);
+        let wanted = grid.pick(&new);
+        let seeds = seed(frame, &submap_from_camera, &mapping.seed, &grid, &wanted, |x, y| color[(x, y)]);
         seeds.iter().map(ball).for_each(|gaussian| self.submap.gaussians.push(gaussian));
 
         let (moved_m, moved_rad) = se3::distance(&self.last_counted, &submap_from_camera);

@@ -45,47 +45,28 @@ impl<'a> From<&'a Picture> for Known<'a> {
     }
 }
 
-/// The pixels of one frame at which the map grows.
-pub struct NewPixels<'a> {
+/// The pixels of one frame at which the map grows. `known` is what the map shows, with the growth test on
+/// `observed_depth_m`.
+pub fn new_pixels<'a>(
     rule: GrowthRule,
-    known: Known<'a>,
-    observed_depth_m: &'a Image<f32>,
+    known: impl Into<Known<'a>>,
+    observed_depth_m: &Image<f32>,
     covered_opacity: f32,
-    /// How far before the rendering a new surface lies, metres.
-    in_front_m: f32,
-}
-
-impl<'a> NewPixels<'a> {
-    /// `known` is what the map shows, with the growth test on `observed_depth_m`.
-    pub fn of(
-        rule: GrowthRule,
-        known: impl Into<Known<'a>>,
-        observed_depth_m: &'a Image<f32>,
-        covered_opacity: f32,
-    ) -> Self {
-        let known = known.into();
-        let in_front_m = match rule {
-            GrowthRule::Usual => DEPTH_MEDIANS * median_error_m(known.depth_m, observed_depth_m),
-            GrowthRule::Adaptive => f32::INFINITY,
-        };
-        NewPixels { rule, known, observed_depth_m, covered_opacity, in_front_m }
-    }
-
-    /// True where the map grows.
-    pub fn holds(&self, x: usize, y: usize) -> bool {
-        let covered = self.known.opacity[(x, y)] >= self.covered_opacity;
-        match self.rule {
-            GrowthRule::Adaptive => {
-                // Eq. 5: no surfel near the observed depth, or the pixel is not covered.
-                let known = self.known.near_surface.is_some_and(|near| near[(x, y)]);
-                !known || !covered
+) -> Image<bool> {
+    let Known { depth_m, opacity, near_surface } = known.into();
+    let in_front_m = match rule {
+        GrowthRule::Adaptive => f32::INFINITY,
+        GrowthRule::Usual => DEPTH_MEDIANS * median_error_m(depth_m, observed_depth_m),
+    };
+    Image::from_fn(observed_depth_m.width(), observed_depth_m.height(), |x, y| {
+        let covered = opacity[(x, y)] >= covered_opacity;
+        !covered
+            || match rule {
+                // Eq. 5: no surfel near the observed depth.
+                GrowthRule::Adaptive => !near_surface.is_some_and(|near| near[(x, y)]),
+                GrowthRule::Usual => depth_m[(x, y)] - observed_depth_m[(x, y)] > in_front_m,
             }
-            GrowthRule::Usual => {
-                let before_m = self.known.depth_m[(x, y)] - self.observed_depth_m[(x, y)];
-                !covered || before_m > self.in_front_m
-            }
-        }
-    }
+    })
 }
 
 /// Of the pixels with depth in both.
@@ -125,8 +106,8 @@ mod tests {
         let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.0 };
         let test = GrowthTest { observed_depth_m, noise, sigma_factor: 3.0, relative: 0.01 };
         let rendering = render(&views, &CAMERA, &RenderSettings::default(), Some(&test));
-        let rule = NewPixels::of(rule, &rendering, observed_depth_m, 0.98);
-        pixels.iter().map(|(x, y)| rule.holds(*x, *y)).collect()
+        let new = new_pixels(rule, &rendering, observed_depth_m, 0.98);
+        pixels.iter().map(|pixel| new[*pixel]).collect()
     }
 
     #[test]

@@ -1,6 +1,6 @@
 use super::*;
 use crate::mapping::optimise::{Adam, OptimiseSettings, Target, optimise_once};
-use crate::mapping::seed::{SeedSettings, seed};
+use crate::mapping::seed::{SeedGrid, SeedSettings, seed};
 use coma_dataset::Sequence;
 use coma_dataset::sequence::rgbd_frame;
 use coma_dataset::world::{World, WorldSettings};
@@ -18,7 +18,9 @@ fn film(width: u32, height: u32) -> impl Sequence {
 fn surfels(frame: &RgbdFrame, spacing_px: usize) -> SurfelCloud {
     let settings = SeedSettings { spacing_px, ..Default::default() };
     let color = frame.color.to_unit();
-    seed(frame, &Pose::identity(), &settings, |_, _| true, |x, y| color[(x, y)]).into_iter().collect()
+    let grid = SeedGrid::of(&frame.camera, &settings);
+    let all = Image::filled(grid.camera.width as usize, grid.camera.height as usize, true);
+    seed(frame, &Pose::identity(), &settings, &grid, &all, |x, y| color[(x, y)]).into_iter().collect()
 }
 
 /// A frame's surfels after some mapping: as they are seeded, the nearest of neighbours that overlap hides the others, and

@@ -42,10 +42,10 @@ pub struct AlignSettings {
 impl Default for AlignSettings {
     fn default() -> Self {
         AlignSettings {
-            steps: vec![8, 6, 4],
-            finest_stride: 2,
+            steps: vec![8, 6],
+            finest_stride: 1,
             max_distance_sigma: 8.0,
-            max_distance_m: 0.03,
+            max_distance_m: 0.06,
             photometric_weight: 0.5,
             min_photometric_scale: 0.008,
             min_geometric_scale: 0.1,
