@@ -56,8 +56,9 @@ impl Variant {
         match self {
             Variant::Ours => "the settings as they are",
             Variant::Gaussians => {
-                "balls of the seeds' size in place of discs, through EWA splatting with gradients of its own; no \
-                 fusion or inheritance, as balls have no normal; a plain path, whose times say nothing of 3D Gaussians"
+                "3D Gaussians in place of discs, fitted to the surface likewise and a tenth as thick as wide, through \
+                 EWA splatting with gradients of its own; all parameters are optimised, without fusion or inheritance; \
+                 a plain path, whose times say nothing of 3D Gaussians"
             }
             Variant::Unfitted => {
                 "random rotation and the mean of the two scales; the optimiser may then turn surfels \
