@@ -50,6 +50,8 @@ pub struct Ablation {
     specs: Vec<String>,
     frames: usize,
     views: usize,
+    /// What all rows share.
+    settings: SlamSettings,
     alone: Vec<Row>,
     cluster: Vec<cluster::Row>,
 }
@@ -89,6 +91,7 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         specs: specs.clone(),
         frames: 0,
         views: arguments.views,
+        settings: settings.clone(),
         alone: Vec::new(),
         cluster: Vec::new(),
     };

@@ -3,6 +3,7 @@
 use super::variant::Variant;
 use super::{Ablation, Row};
 use coma_evaluation::{BarPanel, bars_svg};
+use coma_slam::agent::SlamSettings;
 use std::fmt::Write as _;
 
 fn number(value: Option<f64>, digits: usize) -> String {
@@ -59,7 +60,7 @@ pub fn page(ablation: &Ablation) -> String {
     let mut out = String::from("# What each part is worth\n\n");
     let _ = writeln!(
         out,
-        "{} frames in all: {}.\n",
+        "`coma bench ablation` makes this page. {} frames in all: {}.\n",
         ablation.frames,
         ablation.specs.iter().map(|s| format!("`{}`", shown(s))).collect::<Vec<_>>().join(", ")
     );
@@ -74,6 +75,7 @@ pub fn page(ablation: &Ablation) -> String {
          all agents run as `coma run` runs them, and views are its training views.\n\n",
         ablation.views
     );
+    let _ = writeln!(out, "{}\n", settings(&ablation.settings));
     for row in &ablation.alone {
         let _ = writeln!(out, "- **{}**: {}.", row.variant.name(), row.variant.change());
     }
@@ -81,6 +83,23 @@ pub fn page(ablation: &Ablation) -> String {
         let _ = writeln!(out, "- **{}**: {}.", Variant::NoLoops.name(), Variant::NoLoops.change());
     }
     out
+}
+
+/// What all rows share, in a sentence.
+fn settings(settings: &SlamSettings) -> String {
+    let (mapping, tracking) = (&settings.mapping, &settings.tracking);
+    let which = if *settings == SlamSettings::default() { "the defaults" } else { "not all the defaults" };
+    format!(
+        "Settings are {which}: a seed every {} pixels, {} optimiser steps for each keyframe, every {} frames one, \
+         submaps of {} moving frames, tracking at 1/{} of the resolution by Gauss-Newton and at the whole by Adam, with \
+         {} steps a frame.",
+        mapping.seed.spacing_px,
+        mapping.steps_per_keyframe,
+        mapping.keyframe_every,
+        mapping.moving_frames,
+        1u32 << tracking.finest_level.min(31),
+        tracking.adam.steps
+    )
 }
 
 /// A spec without the folders above its data set: a page says what was measured, not where it lay.
@@ -135,6 +154,7 @@ mod tests {
             specs: vec!["tum:/data/living-room/agent-0[0:60]".into()],
             frames: 60,
             views: 12,
+            settings: SlamSettings::default(),
             alone: vec![row(Variant::Ours, Some(0.123)), row(Variant::Unfused, None)],
             cluster: Vec::new(),
         }
@@ -149,6 +169,7 @@ mod tests {
         );
         assert!(page.contains("| without fusion and inheritance | not measured |"), "{page}");
         assert!(page.contains("`tum:living-room/agent-0[0:60]`") && !page.contains("/data"), "{page}");
+        assert!(page.contains("Settings are the defaults: a seed every 2 pixels"), "{page}");
         assert!(!page.contains("all agents together |"), "what was not run has no table");
     }
 
