@@ -135,3 +135,30 @@ fn a_synthetic_sequence_can_be_written_and_read_back() {
     let table = succeeds(&["bench", "tracking", specs[1]]);
     assert!(table.contains("| 3 | 3 | 0 |"), "three frames, three poses: {table}");
 }
+
+#[test]
+fn an_ablation_leaves_a_table_and_a_picture() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("ablation");
+    let table = succeeds(&[
+        "bench",
+        "ablation",
+        "--frames",
+        "4",
+        "--views",
+        "2",
+        "--rows",
+        "unfitted,gaussians",
+        "world:rooms/agent-0",
+        "--out",
+        out.to_str().unwrap(),
+    ]);
+    let rows =
+        ["| ours |", "| without surfels (3D Gaussians) |", "| without surface-fitting initialisation |"];
+    assert!(rows.iter().all(|row| table.contains(row)), "{table}");
+    assert!(!table.contains("Adam"), "only what was asked for: {table}");
+    let page = std::fs::read_to_string(out.join("ablation.md")).unwrap();
+    assert!(page.contains("world:rooms/agent-0[0:4]") && page.contains("ablation.svg"), "{page}");
+    assert!(std::fs::read_to_string(out.join("ablation.svg")).unwrap().starts_with("<svg"));
+    assert!(fails(&["bench", "ablation", "--frames", "4", "world:rooms/agent-0[0:9]"]).contains("[0:9]"));
+}

@@ -1,5 +1,6 @@
 //! Figures as tables: each bench measures one part.
 
+mod ablation;
 mod blocks;
 mod clock;
 mod cpu;
@@ -21,6 +22,7 @@ use clap::Subcommand;
 pub enum Bench {
     /// One agent alone: accuracy and time per frame.
     Tracking(tracking::Arguments),
+    Ablation(ablation::Arguments),
     Raster(raster::Arguments),
     Registration(registration::Arguments),
     Places(places::Arguments),
@@ -34,6 +36,7 @@ pub enum Bench {
 pub fn run(bench: &Bench) -> anyhow::Result<()> {
     match bench {
         Bench::Tracking(arguments) => tracking::run(arguments),
+        Bench::Ablation(arguments) => ablation::run(arguments),
         Bench::Raster(arguments) => raster::run(arguments),
         Bench::Registration(arguments) => registration::run(arguments),
         Bench::Places(arguments) => places::run(arguments),

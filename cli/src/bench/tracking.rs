@@ -4,6 +4,7 @@
 use crate::source::{self, Source};
 use anyhow::Context;
 use clap::Args;
+use coma_dataset::Sequence;
 use coma_geometry::{AgentId, Epoch, Pose, alignment, se3};
 use coma_slam::agent::{Agent, Event, FrameOptions, SlamSettings};
 use coma_slam::tracking::State;
@@ -199,6 +200,12 @@ fn score(found: &[(usize, Pose)], truth: impl Fn(usize) -> Option<Pose>) -> Opti
         .collect();
     let step = (steps.iter().map(|d| d * d).sum::<f64>() / steps.len().max(1) as f64).sqrt();
     Some((rms, distances.iter().copied().fold(0.0, f64::max), step))
+}
+
+/// RMSE after one rigid alignment, metres; `None` without truth, or where too many frames have no pose.
+pub(super) fn ate_m(found: &[(usize, Pose)], sequence: &dyn Sequence) -> Option<f64> {
+    let enough = found.len() as f64 >= coma_evaluation::LEAST_COVERAGE * sequence.len() as f64;
+    score(found, |index| sequence.truth(index)).filter(|_| enough).map(|(rmse_m, ..)| rmse_m)
 }
 
 fn table(rows: &[Row]) -> String {

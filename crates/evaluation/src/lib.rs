@@ -5,6 +5,7 @@
 //! * [`score_frame`] compares a rendered view with the recorded one; [`PictureScores`] is the mean over views.
 //! * [`NormalisedErrors`] says whether edges of the pose graph are as certain as they claim.
 //! * [`graph_svg`] draws a pose graph before and after a solve.
+//! * [`bars_svg`] draws figures of several variants beside each other.
 //! * [`Report`] holds these beside settings, bytes and times: `report.json`, [`Report::to_markdown`],
 //!   [`Report::to_html`].
 //!
@@ -12,6 +13,7 @@
 //! is `None`: `null` in JSON, "not measured" in tables, never replaced by another.
 
 mod association;
+mod bars_picture;
 mod curve;
 mod edges;
 mod graph_picture;
@@ -22,6 +24,7 @@ mod stats;
 mod trajectory;
 
 pub use association::{Association, associate};
+pub use bars_picture::{BarPanel, bars_svg};
 pub use curve::{Curve, CurvePoint};
 pub use edges::{Edge, NormalisedErrors};
 pub use graph_picture::{GraphPicture, graph_svg};

@@ -9,6 +9,7 @@
 mod backward;
 mod bands;
 mod blend;
+pub mod ewa;
 mod forward;
 mod gradient;
 mod hit;

@@ -6,6 +6,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use oracle::OraclePixel;
 
 mod alike;
+mod gaussians;
 mod poison;
 
 const CAMERA: Intrinsics = Intrinsics { width: 44, height: 36, fx: 40.0, fy: 42.0, cx: 21.5, cy: 17.0 };

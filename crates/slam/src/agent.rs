@@ -210,7 +210,7 @@ impl Agent {
                 Some(tracked) => Located::Tracked(view, tracked),
                 None => Located::Nowhere(view),
             },
-            _ => match self.track(&view) {
+            _ => match self.track(frame, &view) {
                 Ok(tracked) => Located::Tracked(view, tracked),
                 Err(reasons) => Located::Lost(reasons),
             },
@@ -243,7 +243,7 @@ impl Agent {
         events
     }
 
-    fn track(&self, view: &TrackingView) -> Result<Tracked, Vec<Reason>> {
+    fn track(&self, frame: &RgbdFrame, view: &TrackingView) -> Result<Tracked, Vec<Reason>> {
         let settings = &self.settings.tracking;
         let guess = match &self.previous {
             Some(previous) => {
@@ -253,7 +253,7 @@ impl Agent {
             }
             None => self.last_pose,
         };
-        tracking::frame_to_model(&self.model(), view, &guess, self.brightness, settings)
+        tracking::against_model(&self.model(), frame, view, &guess, self.brightness, settings)
     }
 
     fn model(&self) -> Model<'_> {

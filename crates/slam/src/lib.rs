@@ -4,6 +4,7 @@
 //! and its peers' places; [`log`] is how agents tell each other.
 
 pub mod agent;
+pub mod gaussians;
 pub mod log;
 pub mod loop_closure;
 pub mod mapping;

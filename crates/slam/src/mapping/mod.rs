@@ -1,8 +1,10 @@
 //! What does the camera see? Surfels are seeded, grown, optimised and pruned.
 
 pub mod fuse;
+pub mod growth;
 pub mod inherit;
 pub mod optimise;
 pub mod seed;
 pub mod ssim;
 pub mod submap;
+mod unfitted;

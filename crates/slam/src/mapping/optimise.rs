@@ -77,11 +77,33 @@ pub struct Loss {
 /// Pixels or surfels of one task.
 const PART: usize = 4096;
 
+/// What a loss looks at. `[height, width]`
+#[derive(Clone, Copy, Debug)]
+pub struct Rendered<'a> {
+    /// 0..1.
+    pub color: &'a Image<[f32; 3]>,
+    /// Expected depth, metres.
+    pub depth_m: &'a Image<f32>,
+    /// A, 0..1.
+    pub opacity: &'a Image<f32>,
+}
+
+impl<'a> From<&'a Rendering> for Rendered<'a> {
+    fn from(r: &'a Rendering) -> Self {
+        Rendered { color: &r.color, depth_m: &r.depth_m, opacity: &r.opacity }
+    }
+}
+
 /// Eq. 9 and its derivative by every pixel.
-pub fn loss(rendering: &Rendering, target: &Target, settings: &OptimiseSettings) -> (Loss, PixelGradients) {
+pub fn loss<'a>(
+    rendered: impl Into<Rendered<'a>>,
+    target: &Target,
+    settings: &OptimiseSettings,
+) -> (Loss, PixelGradients) {
+    let rendering = rendered.into();
     let (width, height) = (target.color.width(), target.color.height());
     let pixels = (width * height) as f32;
-    let (ssim, ssim_gradient) = ssim_and_gradient(&rendering.color, &target.color);
+    let (ssim, ssim_gradient) = ssim_and_gradient(rendering.color, &target.color);
     let l1_step = (1.0 - settings.ssim_weight) / (3.0 * pixels);
     let mut color = ssim_gradient;
     let mut depth = Image::filled(width, height, 0.0f32);
@@ -244,16 +266,16 @@ static CORRECTIONS: LazyLock<Vec<[f32; 2]>> =
     LazyLock::new(|| (0..10_001).map(|t| [1.0 - BETA1.powi(t), 1.0 - BETA2.powi(t)]).collect());
 
 /// Moves the moments and returns by how much the parameters change.
-fn moments(
-    first: &mut [f32; PARAMETERS],
-    second: &mut [f32; PARAMETERS],
-    g: &[f32; PARAMETERS],
+pub(crate) fn moments<const N: usize>(
+    first: &mut [f32; N],
+    second: &mut [f32; N],
+    g: &[f32; N],
     step: u32,
-    rates: &[f32; PARAMETERS],
-) -> [f32; PARAMETERS] {
+    rates: &[f32; N],
+) -> [f32; N] {
     let [correct1, correct2] = CORRECTIONS[step.min(10_000) as usize];
-    let mut change = [0.0f32; PARAMETERS];
-    for k in 0..PARAMETERS {
+    let mut change = [0.0f32; N];
+    for k in 0..N {
         first[k] = BETA1 * first[k] + (1.0 - BETA1) * g[k];
         second[k] = BETA2 * second[k] + (1.0 - BETA2) * g[k] * g[k];
         change[k] = -rates[k] * (first[k] / correct1) / ((second[k] / correct2).sqrt() + 1e-12);

@@ -1,5 +1,6 @@
 //! New surfels from pixels: surface-fitting initialisation (eq. 6 to 8 of the CoMA-SLAM paper).
 
+use super::unfitted::random_rotation;
 use coma_frame::{Image, RgbdFrame, normals};
 use coma_geometry::{Intrinsics, Pose};
 use coma_surfel::Surfel;
@@ -20,11 +21,33 @@ pub struct SeedSettings {
     /// A surfel on an inclined surface is stretched along the incline so that its picture keeps its size, at
     /// most by this factor. 1 is the paper's eq. 6.
     pub max_stretch: f32,
+    /// How a surfel is turned: `surface` or `random`.
+    pub fit: Fit,
+    /// Of random rotations.
+    pub random_seed: u64,
+}
+
+/// How a new surfel is turned and scaled.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Fit {
+    /// Like the surface that the pixel sees (eq. 6 to 8).
+    #[default]
+    Surface,
+    /// Any way, with the mean of the two scales: what surface-fitting is compared with.
+    Random,
 }
 
 impl Default for SeedSettings {
     fn default() -> Self {
-        SeedSettings { spacing_px: 2, scale_in_spacings: 0.8, opacity: 0.95, max_stretch: 3.0 }
+        SeedSettings {
+            spacing_px: 2,
+            scale_in_spacings: 0.8,
+            opacity: 0.95,
+            max_stretch: 3.0,
+            fit: Fit::Surface,
+            random_seed: 1,
+        }
     }
 }
 
@@ -87,9 +110,15 @@ pub fn seed(
                 continue;
             }
             let (x, y) = grid.pixel(i, j);
-            let Some((center, axes, scale)) = disc(frame, &normal, x, y, settings) else { continue };
+            let Some((center, axes, fitted)) = disc(frame, &normal, x, y, settings) else { continue };
             let submap_axes = Rotation3::from_matrix_unchecked(rotation * axes);
-            let q = UnitQuaternion::from_rotation_matrix(&submap_axes);
+            let (q, scale) = match settings.fit {
+                Fit::Surface => (UnitQuaternion::from_rotation_matrix(&submap_axes), fitted),
+                Fit::Random => (
+                    random_rotation(settings.random_seed, frame.sequence, x, y),
+                    [0.5 * (fitted[0] + fitted[1]); 2],
+                ),
+            };
             out.push(Surfel {
                 center_m: (rotation * center + translation).into(),
                 rotation_wxyz: [q.w, q.i, q.j, q.k],
@@ -157,6 +186,28 @@ mod tests {
             assert!((r[(2, 2)] + 1.0).abs() < 1e-4, "normal {:?}", r.column(2));
             assert!((r.determinant() - 1.0).abs() < 1e-4);
         }
+    }
+
+    #[test]
+    fn surfels_that_are_not_fitted_lie_where_the_others_do_and_face_any_way() {
+        let frame = wall();
+        let of = |fit| {
+            let settings = SeedSettings { fit, ..Default::default() };
+            let grid = SeedGrid::of(&frame.camera, &settings);
+            let all = Image::filled(16, 12, true);
+            seed(&frame, &Pose::identity(), &settings, &grid, &all, |_, _| [0.5; 3])
+        };
+        let (fitted, random) = (of(Fit::Surface), of(Fit::Random));
+        assert_eq!(fitted.len(), random.len());
+        let mut away = 0;
+        for (f, r) in fitted.iter().zip(&random) {
+            assert_eq!(f.center_m, r.center_m);
+            assert_eq!(r.scale_m[0], r.scale_m[1]);
+            assert!((2.0 * r.scale_m[0] - f.scale_m[0] - f.scale_m[1]).abs() < 1e-6);
+            away += (r.rotation()[(2, 2)] > -0.5) as usize;
+        }
+        // Three of four normals are more than 60 degrees from the wall's.
+        assert!(away * 10 > random.len() * 6 && away * 10 < random.len() * 9, "{away} of {}", random.len());
     }
 
     #[test]

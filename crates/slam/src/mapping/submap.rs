@@ -1,6 +1,7 @@
 //! The submap under work: surfels in its own frame, its keyframes, and how they grow.
 
 use super::fuse::{FuseSettings, fuse};
+use super::growth::{GrowthRule, new_pixels};
 use super::inherit::{InheritSettings, Inheritance, inherit};
 use super::optimise::{Adam, Loss, OptimiseSettings, Target, optimise_once};
 use super::seed::{SeedGrid, SeedSettings, seed};
@@ -37,6 +38,8 @@ pub struct MappingSettings {
     pub moved_m: f64,
     /// ... or turned so far, radians.
     pub moved_rad: f64,
+    /// Where the map grows: `adaptive` or `usual`.
+    pub growth: GrowthRule,
     /// Eq. 5: a blended surfel within so many sigma(z) of the observed depth is the same surface ...
     pub growth_sigma: f32,
     /// ... or within this share of the depth.
@@ -60,6 +63,7 @@ impl Default for MappingSettings {
             moved_new_share: 0.02,
             moved_m: 0.02,
             moved_rad: 1f64.to_radians(),
+            growth: GrowthRule::Adaptive,
             growth_sigma: 3.0,
             growth_relative: 0.01,
             covered_opacity: 0.98,
@@ -169,11 +173,7 @@ impl ActiveSubmap {
         let rendering =
             coma_raster::render_only(&views, &grid.camera, &coarse, Some(&test), Outputs::OPTIMISING);
         out.hits += rendering.hits;
-        // Eq. 5: no surfel near the observed depth, or the pixel is not covered.
-        let wanted = Image::from_fn(depth_m.width(), depth_m.height(), |x, y| {
-            let known = rendering.near_surface.as_ref().is_some_and(|near| near[(x, y)]);
-            !known || rendering.opacity[(x, y)] < settings.covered_opacity
-        });
+        let wanted = new_pixels(settings.growth, &rendering, &depth_m, settings.covered_opacity);
         let new_surfels =
             seed(frame, submap_from_camera, &settings.seed, &grid, &wanted, |x, y| color[(x, y)]);
         out.added = new_surfels.len();

@@ -1,14 +1,28 @@
 //! Where is the camera? A guess at constant velocity, then frame-to-frame, then frame-to-model.
 
+pub mod adam;
 pub mod align;
 pub mod model;
 mod rows;
 pub mod view;
 
+use adam::AdamSettings;
 use align::{AlignSettings, Alignment, Brightness, align};
+use coma_frame::RgbdFrame;
 use coma_geometry::{Matrix6, Pose, se3};
 use serde::{Deserialize, Serialize};
 use view::TrackingView;
+
+/// How a frame is brought from its guess to the map.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Method {
+    /// Gauss-Newton on depth and brightness of one rendering.
+    #[default]
+    GaussNewton,
+    /// Adam through the rasteriser: the paper's eq. 4.
+    Adam,
+}
 
 /// How the camera is tracked.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -19,8 +33,12 @@ pub struct TrackingSettings {
     pub finest_level: usize,
     /// Frame against the frame before.
     pub frame_to_frame: AlignSettings,
-    /// Frame against the rendered submaps.
+    /// How a frame is brought from its guess to the map: `gauss-newton` or `adam`.
+    pub method: Method,
+    /// Frame against the rendered submaps, by Gauss-Newton.
     pub frame_to_model: AlignSettings,
+    /// Frame against the rendered submaps, by Adam.
+    pub adam: AdamSettings,
     /// Renders and alignments against the model per frame.
     pub model_rounds: u32,
     /// The model is trusted where it is more opaque than this (eq. 4).
@@ -57,6 +75,8 @@ impl Default for TrackingSettings {
         TrackingSettings {
             finest_level: 1,
             frame_to_frame: AlignSettings::default(),
+            method: Method::default(),
+            adam: AdamSettings::default(),
             frame_to_model: AlignSettings {
                 steps: vec![4, 8],
                 max_distance_m: 0.04,
@@ -162,6 +182,23 @@ pub fn frame_to_frame(
     }
 }
 
+/// Frame to model, by the method of the settings.
+pub fn against_model(
+    model: &model::Model<'_>,
+    frame: &RgbdFrame,
+    view: &TrackingView,
+    guess_agent_from_camera: &Pose,
+    brightness: Brightness,
+    settings: &TrackingSettings,
+) -> Result<Tracked, Vec<Reason>> {
+    match settings.method {
+        Method::GaussNewton => frame_to_model(model, view, guess_agent_from_camera, brightness, settings),
+        Method::Adam => {
+            adam::frame_to_model(model, frame, view, guess_agent_from_camera, brightness, settings)
+        }
+    }
+}
+
 /// Frame to model: renders `model` at the guess and aligns the frame with the picture.
 pub fn frame_to_model(
     model: &model::Model<'_>,
@@ -189,7 +226,18 @@ pub fn frame_to_model(
         last = Some(found);
     }
     let Some(found) = last else { return Err(vec![Reason::NotAligned { with: "the map" }]) };
-    let (metres, radians) = se3::distance(guess_agent_from_camera, &pose);
+    judged(guess_agent_from_camera, &pose, &found, hits, settings)
+}
+
+/// A pose with its certainty, or why it is none: it went too far from its guess, or fits too little.
+pub(crate) fn judged(
+    guess_agent_from_camera: &Pose,
+    pose: &Pose,
+    found: &Alignment,
+    hits: u64,
+    settings: &TrackingSettings,
+) -> Result<Tracked, Vec<Reason>> {
+    let (metres, radians) = se3::distance(guess_agent_from_camera, pose);
     if !(metres <= settings.max_step_m && radians <= settings.max_step_rad) {
         return Err(vec![Reason::Jump { metres, degrees: radians.to_degrees() }]);
     }
@@ -198,8 +246,8 @@ pub fn frame_to_model(
         return Err(vec![Reason::FewFit { share: share * 100.0, needed: settings.lost_share * 100.0 }]);
     }
     Ok(Tracked {
-        agent_from_camera: pose,
-        brightness,
+        agent_from_camera: *pose,
+        brightness: found.brightness,
         covariance: found.covariance(settings.floor_m, settings.floor_rad),
         share,
         map_at_once: share < settings.map_at_once_share,
