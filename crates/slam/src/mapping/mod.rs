@@ -3,6 +3,7 @@
 pub mod fuse;
 pub mod inherit;
 pub mod optimise;
+pub mod refine;
 pub mod seed;
 pub mod ssim;
 pub mod submap;
