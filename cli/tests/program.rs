@@ -102,8 +102,13 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
     let run = path("run");
-    let specs = ["left=world:rooms/agent-0[0:12]", "right=world:rooms/agent-0[6:18]"];
-    succeeds(&[&["run"][..], &specs[..], &["--hold-out", "4", "--out", &run]].concat());
+    let size = ["--frames", "18", "--width", "160", "--height", "120", "--agents", "1"];
+    for side in ["left", "right"] {
+        succeeds(&[&["synth", "rooms", "--out", &path(side)][..], &size[..]].concat());
+    }
+    let left = format!("left=tum:{}/agent-0[0:12]", path("left"));
+    let right = format!("right=tum:{}/agent-0[6:18]", path("right"));
+    succeeds(&["run", &left, &right, "--hold-out", "4", "--out", &run]);
     let base = std::fs::read(folder.path().join("run/map.ply")).unwrap();
     let steps = ["--steps", "40", "--checkpoint-every", "5"];
     let refine = |more: &[&str]| [&["refine", &run][..], &steps[..], more].concat();
@@ -140,9 +145,11 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     assert!(score("refined_held_out") > score("held_out"), "{}", report["pictures"]);
     assert!(report["figures"]["protocol_p"]["psnr_db"] == report["pictures"]["refined_training"]["psnr_db"]);
 
-    // One agent's share: the sequence of the other need not even be there.
+    // One agent's share: nothing of the other's sequence is read, it need not even be there.
     std::fs::remove_dir_all(folder.path().join("run/refined")).unwrap();
+    std::fs::rename(path("left"), path("away")).unwrap();
     succeeds(&refine(&["--agent", "right"]));
+    std::fs::rename(path("away"), path("left")).unwrap();
     let share = json(&refined("share-right.json"));
     let agents: Vec<&str> =
         share["poses"].as_array().unwrap().iter().map(|p| p["agent"].as_str().unwrap()).collect();

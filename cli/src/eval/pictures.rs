@@ -40,12 +40,12 @@ pub fn score(read: &Read, out: &Path, options: &Options) -> anyhow::Result<(Pict
         let source = &read.sources[view.agent];
         let frame = coma_dataset::sequence::rgbd_frame(&*source.sequence, view.frame)?;
         let maps = &maps[view.component];
-        let refined = maps.refined.as_ref().map(|r| (&r.map, refined_pose(read, r, &view)));
-        let base = maps.base.as_ref().map(|map| (map, view.map_from_camera));
+        let refined = maps.refined.as_ref().map(|r| (&r.map, refined_pose(read, r, &view), r.render.clone()));
+        let base = maps.base.as_ref().map(|map| (map, view.map_from_camera, RenderSettings::default()));
         for (kind, map) in [base, refined].into_iter().enumerate() {
-            let Some((surfels, map_from_camera)) = map else { continue };
+            let Some((surfels, map_from_camera, settings)) = map else { continue };
             let views = [SubmapView { surfels, camera_from_submap: map_from_camera.inverse() }];
-            let rendering = coma_raster::render(&views, &frame.camera, &RenderSettings::default(), None);
+            let rendering = coma_raster::render(&views, &frame.camera, &settings, None);
             let recorded = frame.color.to_unit();
             let distance = match &lpips {
                 Some(model) => Some(f64::from(model.distance(&rendering.color, &recorded)?)),

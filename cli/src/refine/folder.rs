@@ -4,6 +4,7 @@ use crate::run::facts::{Facts, SubmapFacts};
 use crate::run::write_atomically;
 use anyhow::{Context, bail};
 use coma_geometry::Pose;
+use coma_raster::RenderSettings;
 use coma_slam::mapping::refine::RefineSettings;
 use coma_surfel::SurfelCloud;
 use serde::{Deserialize, Serialize};
@@ -121,6 +122,8 @@ impl Files {
 pub struct Refined {
     /// All its surfels.
     pub map: SurfelCloud,
+    /// How it is rendered.
+    pub render: RenderSettings,
     /// By agent's name and frame.
     pub poses: BTreeMap<(String, usize), Pose>,
 }
@@ -130,7 +133,8 @@ pub struct Refined {
 pub fn read(run: &Path, facts: &Facts, component: usize) -> anyhow::Result<Option<Refined>> {
     let by_frame = |facts: RefinedFacts| facts.poses.into_iter().map(|p| ((p.agent, p.frame), p.map_from_camera));
     if let Some((map, refined)) = Files::new(run, component, None).read(facts, component)? {
-        return Ok(Some(Refined { map, poses: by_frame(refined).collect() }));
+        let render = refined.settings.render();
+        return Ok(Some(Refined { map, render, poses: by_frame(refined).collect() }));
     }
     let mut shares = BTreeMap::new();
     for agent in &facts.agents {
@@ -142,7 +146,8 @@ pub fn read(run: &Path, facts: &Facts, component: usize) -> anyhow::Result<Optio
         return Ok(None);
     }
     let base = read_map(&run.join(&facts.components[component].map))?;
-    let mut out = Refined { map: SurfelCloud::default(), poses: BTreeMap::new() };
+    let render = shares.values().next().map(|(_, refined)| refined.settings.render()).unwrap_or_default();
+    let mut out = Refined { map: SurfelCloud::default(), render, poses: BTreeMap::new() };
     for (agent, range) in owners(facts, component, &base)? {
         match shares.remove(&agent) {
             Some((share, refined)) => {

@@ -73,28 +73,43 @@ const HALF_OFFSET: f32 = 0.25 / 0.8;
 
 /// Splits and drops; returns which surfel each was before, `None` where it is new. The order is kept.
 pub(super) fn split(surfels: &mut SurfelCloud, seen: &[Seen], settings: &RefineSettings) -> Vec<Option<u32>> {
-    let mut room = settings.max_surfels.saturating_sub(surfels.len());
+    let chosen = chosen(surfels, seen, settings);
     let mut out = SurfelCloud::default();
     let mut sources = Vec::with_capacity(surfels.len());
-    for (i, (surfel, seen)) in surfels.iter().zip(seen).enumerate() {
+    for (i, (surfel, halved)) in surfels.iter().zip(chosen).enumerate() {
         if !(surfel.opacity >= settings.prune_opacity) {
             continue;
         }
-        let errs = seen.color > settings.split_color * seen.weight
-            || seen.depth_m > settings.split_depth_m * seen.weight;
-        let halved = seen.px.map(|px| errs && px > settings.split_px);
-        if halved == [false, false] || room < 3 {
+        if halved == [false, false] {
             out.push(surfel);
             sources.push(Some(i as u32));
             continue;
         }
         let parts = parts(&surfel, halved);
-        room -= parts.len() - 1;
         sources.extend(parts.iter().map(|_| None));
         parts.into_iter().for_each(|part| out.push(part));
     }
     *surfels = out;
     sources
+}
+
+/// Along which axes each surfel is halved: those whose pixels err, with the largest sums of errors first, as far as
+/// there is room.
+fn chosen(surfels: &SurfelCloud, seen: &[Seen], settings: &RefineSettings) -> Vec<[bool; 2]> {
+    // Both kinds of error in units of what is let pass.
+    let error = |s: &Seen| (s.color / settings.split_color).max(s.depth_m / settings.split_depth_m);
+    let halved = |s: &Seen| s.px.map(|px| error(s) > s.weight && px > settings.split_px);
+    let mut asking: Vec<(f32, usize)> =
+        seen.iter().enumerate().filter(|(_, s)| halved(s) != [false; 2]).map(|(i, s)| (error(s), i)).collect();
+    asking.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    let most = (settings.split_share * surfels.len() as f32).ceil() as usize;
+    // One becomes four at most.
+    let room = settings.max_surfels.saturating_sub(surfels.len()) / 3;
+    let mut out = vec![[false; 2]; surfels.len()];
+    for (_, i) in asking.into_iter().take(most.min(room)) {
+        out[i] = halved(&seen[i]);
+    }
+    out
 }
 
 /// Two or four surfels in place of one, halved along the axes that are marked.

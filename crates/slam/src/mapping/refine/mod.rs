@@ -66,9 +66,9 @@ impl Refiner {
     ) -> Self {
         let fingerprint = checkpoint::fingerprint(&settings, &surfels, &fixed, &map_from_cameras);
         Refiner {
-            settings,
             tracking: TrackingSettings::default(),
-            render: RenderSettings::default(),
+            render: settings.render(),
+            settings,
             fingerprint,
             fixed,
             adam: Adam::new(surfels.len()),
@@ -124,7 +124,7 @@ impl Refiner {
             noise: frame.noise,
         };
         if self.settings.exposure {
-            brighten(&mut target.color, &rendering.color, self.settings.exposure_prior);
+            brighten(&mut target.color, &rendering, self.settings.exposure_prior);
         }
         let (loss, pixels) = loss(&rendering, &target, &self.settings.optimise);
         let out = Step {
@@ -238,11 +238,14 @@ fn shuffled(count: u32, seed: u64, round: u32) -> Vec<u32> {
     out
 }
 
-/// Brings a picture to the rendering's brightness by one gain, the ratio of their sums pulled towards 1: a fit of one
-/// to the other would shrink it a little, step by step.
-fn brighten(picture: &mut Image<[f32; 3]>, rendering: &Image<[f32; 3]>, prior: f32) {
-    let sum = |image: &Image<[f32; 3]>| -> f64 { image.pixels().iter().flatten().map(|v| f64::from(*v)).sum() };
-    let (wanted, has, prior) = (sum(rendering), sum(picture), f64::from(prior));
+/// Brings a picture to the rendering's brightness, where that is opaque, by one gain: the ratio of their sums pulled
+/// towards 1. A fit of one to the other would shrink it a little, step by step.
+fn brighten(picture: &mut Image<[f32; 3]>, rendering: &Rendering, prior: f32) {
+    let sum = |image: &Image<[f32; 3]>| -> f64 {
+        let pixels = image.pixels().iter().zip(rendering.opacity.pixels());
+        pixels.filter(|(_, opacity)| **opacity > 0.9).flat_map(|(pixel, _)| pixel).map(|v| f64::from(*v)).sum()
+    };
+    let (wanted, has, prior) = (sum(&rendering.color), sum(picture), f64::from(prior));
     let gain = ((wanted + prior * has) / ((1.0 + prior) * has)).clamp(0.5, 2.0);
     if gain.is_finite() {
         for pixel in picture.pixels_mut() {

@@ -2,6 +2,7 @@
 
 use crate::mapping::optimise::OptimiseSettings;
 use crate::mapping::seed::SeedSettings;
+use coma_raster::RenderSettings;
 use serde::{Deserialize, Serialize};
 
 /// How a finished map is refined.
@@ -32,6 +33,10 @@ pub struct RefineSettings {
     /// Only a surfel whose standard deviation on the screen is larger is split, pixels. One of a grid with spacing 1
     /// pixel has 0.8.
     pub split_px: f32,
+    /// At most this share of the surfels is split at once: those with the largest sum of errors.
+    pub split_share: f32,
+    /// Standard deviation of the renderer's low-pass, pixels: the default blurs silhouettes.
+    pub low_pass_px: f32,
     /// Fainter surfels are dropped.
     pub prune_opacity: f32,
     /// Pixels with depth that are less opaque get new surfels.
@@ -72,6 +77,8 @@ impl Default for RefineSettings {
             split_color: 0.008,
             split_depth_m: 0.01,
             split_px: 1.0,
+            split_share: 0.06,
+            low_pass_px: 0.4,
             prune_opacity: 0.05,
             hole_opacity: 0.7,
             seed_holes: SeedSettings { spacing_px: 1, ..SeedSettings::default() },
@@ -85,6 +92,11 @@ impl Default for RefineSettings {
 }
 
 impl RefineSettings {
+    /// How a map that was refined with these is rendered.
+    pub fn render(&self) -> RenderSettings {
+        RenderSettings { low_pass_px: self.low_pass_px, ..RenderSettings::default() }
+    }
+
     /// The first step in which the map grows no more.
     pub(super) fn grow_until(&self) -> u32 {
         (self.steps as f32 * self.grow_share) as u32

@@ -1,4 +1,5 @@
 use super::*;
+use crate::mapping::seed::SeedSettings;
 use coma_frame::DepthNoise;
 use coma_geometry::{Intrinsics, StampNs, se3};
 use nalgebra::Vector3;
@@ -64,7 +65,7 @@ fn refined_pictures_are_better_and_surfels_stay_on_the_wall() {
     assert_eq!((steps.len(), job.wants()), (120, None));
     let mean = |steps: &[Step]| steps.iter().map(|s| s.psnr_db).sum::<f64>() / steps.len() as f64;
     let (first, last) = (mean(&steps[..5]), mean(&steps[115..]));
-    assert!(last > first + 6.0, "{first:.2} dB became {last:.2} dB");
+    assert!(last > first + 5.0, "{first:.2} dB became {last:.2} dB");
     assert!(job.surfels().len() > before, "texture finer than the surfels splits them");
     // Surfels of the front view's rim are seen by few; the middle ones tell.
     let off: Vec<f32> = job
