@@ -12,6 +12,7 @@ mod inspect_loops;
 mod models;
 mod play;
 mod progress;
+mod refine;
 mod run;
 mod serve;
 mod source;
@@ -23,7 +24,7 @@ use clap::{Parser, Subcommand};
 /// CoMA: several RGB-D cameras build one map together, peer to peer.
 ///
 /// Begin with `coma demo`: a cluster on a built-in world, in the browser. `coma run` does the same with recorded
-/// sequences and scores the result; `coma agent`, `coma gateway` and `coma stream` are the parts of a real cluster.
+/// sequences and scores the result, `coma refine` improves its map; `coma agent`, `coma gateway` and `coma stream` are the parts of a real cluster.
 #[derive(Parser)]
 #[command(version)]
 struct Arguments {
@@ -35,6 +36,7 @@ struct Arguments {
 enum Command {
     Demo(demo::Arguments),
     Run(run::Arguments),
+    Refine(refine::Arguments),
     Eval(eval::Arguments),
     Agent(serve::AgentArguments),
     /// Describes pictures and finds places that agents have seen before, for one agent or several.
@@ -73,6 +75,7 @@ async fn main() -> anyhow::Result<()> {
     match arguments.command {
         Command::Demo(arguments) => demo::run(arguments).await,
         Command::Run(arguments) => run::run(arguments).await,
+        Command::Refine(arguments) => refine::run(arguments).await,
         Command::Eval(arguments) => eval::run(arguments).await,
         Command::Agent(arguments) => serve::agent(arguments).await,
         Command::PlaceRecognition(arguments) => serve::place_recognition(arguments).await,

@@ -40,6 +40,7 @@ fn help_names_every_command_and_shows_how_to_begin() {
         "dpgo",
         "gateway",
         "stream",
+        "refine",
         "eval",
         "export",
         "synth",
@@ -97,6 +98,70 @@ fn a_run_leaves_a_folder_that_can_be_scored_again() {
 }
 
 #[test]
+fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let run = path("run");
+    let size = ["--frames", "18", "--width", "160", "--height", "120", "--agents", "1"];
+    for side in ["left", "right"] {
+        succeeds(&[&["synth", "rooms", "--out", &path(side)][..], &size[..]].concat());
+    }
+    let left = format!("left=tum:{}/agent-0[0:12]", path("left"));
+    let right = format!("right=tum:{}/agent-0[6:18]", path("right"));
+    succeeds(&["run", &left, &right, "--hold-out", "4", "--out", &run]);
+    let base = std::fs::read(folder.path().join("run/map.ply")).unwrap();
+    let steps = ["--steps", "40", "--checkpoint-every", "5"];
+    let refine = |more: &[&str]| [&["refine", &run][..], &steps[..], more].concat();
+    let refined = |name: &str| folder.path().join("run/refined").join(name);
+
+    // Killed once a checkpoint is there.
+    let arguments = refine(&[]);
+    let mut child = Command::new(env!("CARGO_BIN_EXE_coma")).args(&arguments).spawn().expect("it starts");
+    while !refined("map.checkpoint").exists() {
+        assert!(child.try_wait().unwrap().is_none(), "it ended without a checkpoint");
+        std::thread::yield_now();
+    }
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let whole = std::fs::read(refined("map.checkpoint")).unwrap();
+    std::fs::write(refined("map.checkpoint"), &whole[..whole.len() - 7]).unwrap();
+    let torn = fails(&arguments);
+    assert!(torn.contains("map.checkpoint") && torn.contains("torn"), "{torn}");
+    std::fs::write(refined("map.checkpoint"), &whole).unwrap();
+    assert!(succeeds(&arguments).contains("goes on after step"));
+    let cut_off = std::fs::read(refined("map.ply")).unwrap();
+    assert!(!refined("map.checkpoint").exists());
+    let again = fails(&arguments);
+    assert!(again.contains("map.json"), "a refined map is not overwritten: {again}");
+    std::fs::remove_dir_all(folder.path().join("run/refined")).unwrap();
+    succeeds(&arguments);
+    assert!(std::fs::read(refined("map.ply")).unwrap() == cut_off, "the same bits");
+    assert!(std::fs::read(folder.path().join("run/map.ply")).unwrap() == base, "the run's own map stays");
+
+    succeeds(&["eval", &run]);
+    let report = json(&folder.path().join("run/report.json"));
+    let score = |kind: &str| report["pictures"][kind]["psnr_db"].as_f64().unwrap();
+    assert!(score("refined_training") > score("training") + 1.0, "{}", report["pictures"]);
+    assert!(score("refined_held_out") > score("held_out"), "{}", report["pictures"]);
+    assert!(report["figures"]["protocol_p"]["psnr_db"] == report["pictures"]["refined_training"]["psnr_db"]);
+
+    // One agent's share: nothing of the other's sequence is read, it need not even be there.
+    std::fs::remove_dir_all(folder.path().join("run/refined")).unwrap();
+    std::fs::rename(path("left"), path("away")).unwrap();
+    succeeds(&refine(&["--agent", "right"]));
+    std::fs::rename(path("away"), path("left")).unwrap();
+    let share = json(&refined("share-right.json"));
+    let agents: Vec<&str> =
+        share["poses"].as_array().unwrap().iter().map(|p| p["agent"].as_str().unwrap()).collect();
+    assert!(agents.len() == 9 && agents.iter().all(|a| *a == "right"), "{agents:?}");
+    succeeds(&["eval", &run]);
+    let report = json(&folder.path().join("run/report.json"));
+    assert!(report["pictures"]["refined_training"]["psnr_db"].as_f64().is_some(), "{}", report["pictures"]);
+    let unknown = fails(&refine(&["--agent", "middle"]));
+    assert!(unknown.contains("middle") && unknown.contains("left, right"), "{unknown}");
+}
+
+#[test]
 fn what_is_wrong_is_said_with_the_name_of_the_file_or_argument() {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
@@ -111,6 +176,7 @@ fn what_is_wrong_is_said_with_the_name_of_the_file_or_argument() {
         ),
         (vec!["run", "world:rooms/agent-0[0:5]", "--out", &out, "--fault", "fog:1-2"], "fog"),
         (vec!["eval", &out], "run.json"),
+        (vec!["refine", &out], "run.json"),
         (vec!["stream", "world:rooms/agent-0[0:5]", "--to", "nowhere"], "nowhere"),
         (vec!["demo", "--agents", "0"], "--agents"),
     ] {

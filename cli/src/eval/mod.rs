@@ -13,6 +13,7 @@ use coma_evaluation::{
     AgentSummary, EdgeErrors, LoopCounts, LoopLine, MapSize, NormalisedErrors, Plots, Report, RunInfo,
     RunTrajectories, StageTime, Times, Track, Traffic,
 };
+use coma_dataset::Sequence;
 use coma_geometry::{AgentId, Pose, StampNs, tum};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -125,10 +126,7 @@ fn score_now(out: &Path, options: &Options) -> anyhow::Result<()> {
 impl Read {
     /// Reads the folder that `coma run` wrote; the sequences must lie where they lay then.
     pub fn open(out: &Path) -> anyhow::Result<Self> {
-        let path = out.join("run.json");
-        let text = std::fs::read_to_string(&path)
-            .with_context(|| format!("{} is no run's folder: run.json can't be read", out.display()))?;
-        let facts: Facts = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
+        let facts = Facts::read(out)?;
         let path = out.join("loops.json");
         let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
         let loops: Vec<LoopFacts> =
@@ -177,29 +175,37 @@ impl Read {
     }
 }
 
-/// Reads the trajectory files; every pose finds its frame by its stamp's text.
+/// Reads the trajectory files.
 fn tracks(out: &Path, facts: &Facts, sources: &[Source]) -> anyhow::Result<Tracks> {
     let mut tracks = BTreeMap::new();
     for (agent, known) in facts.agents.iter().enumerate() {
-        let sequence = &sources[agent].sequence;
-        let frames: BTreeMap<StampNs, usize> = (0..sequence.len()).map(|i| (sequence.stamp(i), i)).collect();
         let components: BTreeSet<usize> = known.poses.iter().map(|p| p.component).collect();
         for component in components {
-            let path = out.join("trajectories").join(trajectory_name(facts, agent, component));
-            let shown = || path.display().to_string();
-            let text = std::fs::read_to_string(&path).with_context(shown)?;
-            let poses = tum::parse(&text).with_context(shown)?;
-            let of_frame = |p: &tum::StampedPose| {
-                let frame = frames.get(&p.stamp).copied();
-                let frame =
-                    frame.with_context(|| format!("{}: no frame has the stamp {}", shown(), p.stamp_text))?;
-                anyhow::Ok((frame, p.pose))
-            };
-            let poses = poses.iter().map(of_frame).collect::<anyhow::Result<Vec<_>>>()?;
+            let poses = track(out, facts, agent, component, &*sources[agent].sequence)?;
             tracks.insert((agent, component), poses);
         }
     }
     Ok(tracks)
+}
+
+/// Reads one trajectory file: frame and `map_from_camera`. Every pose finds its frame by its stamp.
+pub fn track(
+    out: &Path,
+    facts: &Facts,
+    agent: usize,
+    component: usize,
+    sequence: &dyn Sequence,
+) -> anyhow::Result<Vec<(usize, Pose)>> {
+    let frames: BTreeMap<StampNs, usize> = (0..sequence.len()).map(|i| (sequence.stamp(i), i)).collect();
+    let path = out.join("trajectories").join(trajectory_name(facts, agent, component));
+    let shown = || path.display().to_string();
+    let text = std::fs::read_to_string(&path).with_context(shown)?;
+    let of_frame = |p: tum::StampedPose| {
+        let frame = frames.get(&p.stamp).copied();
+        let frame = frame.with_context(|| format!("{}: no frame has the stamp {}", shown(), p.stamp_text))?;
+        Ok((frame, p.pose))
+    };
+    tum::parse(&text).with_context(shown)?.into_iter().map(of_frame).collect()
 }
 
 fn summary(read: &Read, index: usize, agent: &AgentFacts) -> anyhow::Result<AgentSummary> {

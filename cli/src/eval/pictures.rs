@@ -2,22 +2,22 @@
 
 use super::{Options, Read};
 use crate::progress;
+use crate::refine::folder::{self, Refined};
 use crate::run::facts::Facts;
 use anyhow::Context;
 use coma_evaluation::{FrameScore, Picture, PictureScores, Pictures, View, score_frame};
 use coma_frame::{Image, RgbdFrame};
+use coma_geometry::{Pose, se3};
 use coma_raster::{RenderSettings, Rendering, SubmapView};
 use coma_surfel::SurfelCloud;
 use image::{RgbImage, imageops};
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// Surfels that a map may have when it is read back.
-const MAX_SURFELS: usize = 50_000_000;
 /// Views of each agent that are kept as pictures.
 const SHOWN: usize = 3;
 
-/// Scores held-out views and others apart; writes a few pictures to `renders/`.
+/// Scores held-out views and others apart, before refinement and after; writes a few pictures to `renders/`.
 pub fn score(read: &Read, out: &Path, options: &Options) -> anyhow::Result<(Pictures, Vec<Picture>)> {
     if options.views == 0 {
         return Ok((Pictures::default(), Vec::new()));
@@ -26,67 +26,107 @@ pub fn score(read: &Read, out: &Path, options: &Options) -> anyhow::Result<(Pict
         Some(path) => Some(coma_encoder::Perceptual::open(path, &coma_encoder::RuntimeSettings::default())?),
         None => None,
     };
-    let maps: Vec<Option<SurfelCloud>> =
-        read.facts.components.iter().map(|c| map(out, &c.map)).collect::<Result<_, _>>()?;
+    let maps: Vec<Maps> =
+        (0..read.facts.components.len()).map(|c| Maps::read(out, &read.facts, c)).collect::<Result<_, _>>()?;
     let plan = plan(read, options.views);
     let bar = progress::steps("rendering", plan.len() as u64);
     let renders = out.join("renders");
     std::fs::create_dir_all(&renders).with_context(|| renders.display().to_string())?;
-    let (mut training, mut held_out, mut shown) = (Vec::new(), Vec::new(), Vec::new());
+    // Held out or not, refined or not.
+    let mut scores: [[Vec<FrameScore>; 2]; 2] = Default::default();
+    let mut shown = Vec::new();
     for view in plan {
         bar.inc(1);
-        let Some(map) = &maps[view.component] else { continue };
         let source = &read.sources[view.agent];
         let frame = coma_dataset::sequence::rgbd_frame(&*source.sequence, view.frame)?;
-        let camera_from_submap = view.map_from_camera.inverse();
-        let views = [SubmapView { surfels: map, camera_from_submap }];
-        let rendering = coma_raster::render(&views, &frame.camera, &RenderSettings::default(), None);
-        let recorded = frame.color.to_unit();
-        let distance = match &lpips {
-            Some(model) => Some(f64::from(model.distance(&rendering.color, &recorded)?)),
-            None => None,
-        };
-        let score: FrameScore = score_frame(
-            View { color: &rendering.color, depth_m: &rendering.depth_m },
-            View { color: &recorded, depth_m: &frame.depth_m },
-            distance,
-        )?;
-        if view.held_out {
-            held_out.push(score)
-        } else {
-            training.push(score)
-        }
-        if view.shown {
-            let name = format!("{}-{:06}.png", source.agent, view.frame);
-            let path = renders.join(&name);
-            beside(&frame, &rendering).save(&path).with_context(|| path.display().to_string())?;
-            let what = if view.held_out { "held out" } else { "mapped" };
-            let caption = format!(
-                "{} frame {} ({what}): recorded, rendered, error x 4; depth likewise. PSNR {:.1} dB",
-                source.agent, view.frame, score.psnr_db
-            );
-            shown.push(Picture { path: format!("renders/{name}"), caption });
+        let maps = &maps[view.component];
+        let refined = maps.refined.as_ref().map(|r| (&r.map, refined_pose(read, r, &view), r.render.clone()));
+        let base = maps.base.as_ref().map(|map| (map, view.map_from_camera, RenderSettings::default()));
+        for (kind, map) in [base, refined].into_iter().enumerate() {
+            let Some((surfels, map_from_camera, settings)) = map else { continue };
+            let views = [SubmapView { surfels, camera_from_submap: map_from_camera.inverse() }];
+            let rendering = coma_raster::render(&views, &frame.camera, &settings, None);
+            let recorded = frame.color.to_unit();
+            let distance = match &lpips {
+                Some(model) => Some(f64::from(model.distance(&rendering.color, &recorded)?)),
+                None => None,
+            };
+            let score: FrameScore = score_frame(
+                View { color: &rendering.color, depth_m: &rendering.depth_m },
+                View { color: &recorded, depth_m: &frame.depth_m },
+                distance,
+            )?;
+            scores[usize::from(view.held_out)][kind].push(score);
+            if view.shown {
+                let (suffix, map) = [("", "map"), ("-refined", "refined map")][kind];
+                let name = format!("{}-{:06}{suffix}.png", source.agent, view.frame);
+                let path = renders.join(&name);
+                beside(&frame, &rendering).save(&path).with_context(|| path.display().to_string())?;
+                let what = if view.held_out { "held out" } else { "mapped" };
+                let caption = format!(
+                    "{} frame {} ({what}), {map}: recorded, rendered, error x 4; depth likewise. PSNR {:.1} dB",
+                    source.agent, view.frame, score.psnr_db
+                );
+                shown.push(Picture { path: format!("renders/{name}"), caption });
+            }
         }
     }
     bar.finish_and_clear();
-    Ok((Pictures { held_out: PictureScores::of(&held_out), training: PictureScores::of(&training) }, shown))
+    let [training, held_out] = &scores;
+    let pictures = Pictures {
+        held_out: PictureScores::of(&held_out[0]),
+        training: PictureScores::of(&training[0]),
+        refined_held_out: PictureScores::of(&held_out[1]),
+        refined_training: PictureScores::of(&training[1]),
+    };
+    Ok((pictures, shown))
 }
 
-fn map(out: &Path, name: &str) -> anyhow::Result<Option<SurfelCloud>> {
-    if name.is_empty() {
-        return Ok(None);
+/// A component's map as the run left it, and refined.
+struct Maps {
+    base: Option<SurfelCloud>,
+    refined: Option<Refined>,
+}
+
+impl Maps {
+    fn read(out: &Path, facts: &Facts, component: usize) -> anyhow::Result<Self> {
+        let name = &facts.components[component].map;
+        if name.is_empty() {
+            return Ok(Maps { base: None, refined: None });
+        }
+        let base = folder::read_map(&out.join(name))?;
+        Ok(Maps { base: Some(base), refined: folder::read(out, facts, component)? })
     }
-    let path = out.join(name);
-    let shown = || path.display().to_string();
-    let bytes = std::fs::read(&path).with_context(shown)?;
-    Ok(Some(coma_surfel::ply::read(&bytes, MAX_SURFELS).with_context(shown)?))
+}
+
+/// Where the refined map sees a view. One that it was not refined by (a held-out one) takes the corrections of its
+/// neighbours in time: its own picture is not looked at.
+fn refined_pose(read: &Read, refined: &Refined, view: &Planned) -> Pose {
+    let name = &read.sources[view.agent].agent;
+    let at = |frame: usize| refined.poses.get(&(name.clone(), frame));
+    if let Some(pose) = at(view.frame) {
+        return *pose;
+    }
+    let Some(track) = read.tracks.get(&(view.agent, view.component)) else { return view.map_from_camera };
+    let correction = |(frame, run): &(usize, Pose)| Some((*frame, run.inverse() * at(*frame)?));
+    let before = track.iter().filter(|(f, _)| *f < view.frame).filter_map(correction).next_back();
+    let after = track.iter().filter(|(f, _)| *f > view.frame).find_map(correction);
+    let by = match (before, after) {
+        (Some((a, before)), Some((b, after))) => {
+            let share = (view.frame - a) as f64 / (b - a) as f64;
+            before * se3::exp(&(se3::log(&(before.inverse() * after)) * share))
+        }
+        (Some((_, one)), None) | (None, Some((_, one))) => one,
+        (None, None) => Pose::identity(),
+    };
+    view.map_from_camera * by
 }
 
 struct Planned {
     agent: usize,
     component: usize,
     frame: usize,
-    map_from_camera: coma_geometry::Pose,
+    map_from_camera: Pose,
     held_out: bool,
     shown: bool,
 }
@@ -103,7 +143,7 @@ fn plan(read: &Read, views: usize) -> Vec<Planned> {
             .collect();
         for held_out in [true, false] {
             let kind: Vec<_> =
-                poses.iter().filter(|p| is_held_out(&read.facts, agent, p.1) == held_out).collect();
+                poses.iter().filter(|p| read.facts.is_held_out(agent, p.1) == held_out).collect();
             let picked = spread(kind.len(), views);
             let shown: BTreeSet<usize> = spread(picked.len(), SHOWN).into_iter().map(|i| picked[i]).collect();
             out.extend(picked.iter().map(|i| {
@@ -113,12 +153,6 @@ fn plan(read: &Read, views: usize) -> Vec<Planned> {
         }
     }
     out
-}
-
-/// The rhythm of sessions: every k-th frame, never the first.
-fn is_held_out(facts: &Facts, agent: usize, frame: usize) -> bool {
-    let every = facts.agents[agent].hold_out_every as usize;
-    every > 0 && frame > 0 && frame.is_multiple_of(every)
 }
 
 /// At most `wanted` of `0..count`, evenly spread.

@@ -1,10 +1,12 @@
 //! What a run left: `run.json` and `loops.json` in its folder. Scores are made from these, the trajectories, the
 //! map and the truth, and can be made again at any time.
 
+use anyhow::Context;
 use coma_evaluation::SentBytes;
 use coma_geometry::{Matrix6, Pose, SubmapId};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::path::Path;
 
 /// `run.json`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -38,6 +40,22 @@ pub struct Facts {
     pub not_joined: Vec<String>,
     /// Motions between submaps that follow each other.
     pub odometry: Vec<EdgeFacts>,
+}
+
+impl Facts {
+    /// Reads `run.json` of a run's folder.
+    pub fn read(out: &Path) -> anyhow::Result<Self> {
+        let path = out.join("run.json");
+        let text = std::fs::read_to_string(&path)
+            .with_context(|| format!("{} is no run's folder: run.json can't be read", out.display()))?;
+        serde_json::from_str(&text).with_context(|| path.display().to_string())
+    }
+
+    /// The rhythm of sessions: every k-th frame, never the first.
+    pub fn is_held_out(&self, agent: usize, frame: usize) -> bool {
+        let every = self.agents[agent].hold_out_every as usize;
+        every > 0 && frame > 0 && frame.is_multiple_of(every)
+    }
 }
 
 /// One agent's part of a run.
@@ -99,6 +117,10 @@ pub struct SubmapFacts {
     pub surfels: usize,
     /// Packed, bytes.
     pub packed_bytes: u64,
+    /// Of its surfels in the merged map, which holds submap by submap in the order of their names; absent in runs of
+    /// older versions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub merged_surfels: Option<usize>,
 }
 
 /// One connected map.

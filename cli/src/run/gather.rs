@@ -6,7 +6,7 @@ use coma_evaluation::{SentBytes, TrafficClass};
 use coma_geometry::{Pose, StampNs, SubmapId};
 use coma_slam::log::{EntryKey, LoopOutcome, Payload};
 use coma_surfel::SurfelCloud;
-use coma_surfel::merge::{MergeSettings, Part, merge};
+use coma_surfel::merge::{MergeSettings, Part, merge_counted};
 use coma_wire::{At, Wire, v1};
 use std::collections::BTreeMap;
 
@@ -60,10 +60,17 @@ pub fn gather(
     let mut submaps: Vec<&Submap> = from_agents.iter().flat_map(|f| &f.submaps).collect();
     submaps.sort_by(|a, b| a.id.cmp(&b.id));
     for (index, component) in facts.components.iter_mut().enumerate() {
-        let mine = submaps.iter().filter(|s| component_of.get(&s.id) == Some(&index));
+        let mine = submaps.iter().copied().filter(|s| component_of.get(&s.id) == Some(&index));
+        let mine: Vec<&Submap> = mine.collect();
         let parts: Vec<Part> =
-            mine.map(|s| Part { surfels: &s.surfels, map_from_submap: s.map_from_submap }).collect();
-        let map = merge(&parts, &MergeSettings::default());
+            mine.iter().map(|s| Part { surfels: &s.surfels, map_from_submap: s.map_from_submap }).collect();
+        let (map, kept) = merge_counted(&parts, &MergeSettings::default());
+        let kept: BTreeMap<&SubmapId, usize> = mine.iter().map(|s| &s.id).zip(kept).collect();
+        for submap in facts.agents.iter_mut().flat_map(|a| &mut a.submaps) {
+            if let Some(kept) = kept.get(&submap.id) {
+                submap.merged_surfels = Some(*kept);
+            }
+        }
         component.surfels = map.len();
         component.map = if index == 0 { "map.ply".into() } else { format!("map-{index}.ply") };
         results.maps.push(map);
@@ -275,6 +282,7 @@ fn agent(
             component: component_of.get(&s.id).copied(),
             surfels: s.surfels.len(),
             packed_bytes: s.packed_bytes,
+            merged_surfels: None,
         })
         .collect();
 }

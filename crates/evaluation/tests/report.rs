@@ -75,6 +75,7 @@ fn full(merged: bool) -> Report {
         pictures: Pictures {
             held_out: PictureScores::of(&[view(0.7), view(0.1)]),
             training: PictureScores::of(&[view(-3.3)]),
+            ..Pictures::default()
         },
         map: Some(MapSize { submaps: 43, surfels: 412_345, bytes: 9_896_280 }),
         traffic: Some(Traffic::of([

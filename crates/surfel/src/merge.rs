@@ -52,6 +52,11 @@ struct Share {
 
 /// One cloud in the map, submap by submap in the order given. Surfels that are not finite are left out.
 pub fn merge(parts: &[Part<'_>], settings: &MergeSettings) -> SurfelCloud {
+    merge_counted(parts, settings).0
+}
+
+/// As [`merge`], and how many surfels of each submap are kept.
+pub fn merge_counted(parts: &[Part<'_>], settings: &MergeSettings) -> (SurfelCloud, Vec<usize>) {
     let face_m2 = (settings.cell_m * settings.cell_m) as f32;
     let mut shares: HashMap<Cell, Vec<Share>> = HashMap::new();
     for (part, surfel) in placed(parts) {
@@ -67,15 +72,16 @@ pub fn merge(parts: &[Part<'_>], settings: &MergeSettings) -> SurfelCloud {
         }
     }
     let mut keepers: HashMap<Cell, Option<usize>> = HashMap::new();
-    let mut out = SurfelCloud::default();
+    let (mut out, mut kept) = (SurfelCloud::default(), vec![0; parts.len()]);
     for (part, surfel) in placed(parts) {
         let cell = cell(&surfel, settings.cell_m);
         let keeper = *keepers.entry(cell).or_insert_with(|| keeper(&shares, cell, face_m2, settings));
         if keeper.is_none_or(|keeper| keeper == part) {
             out.push(surfel);
+            kept[part] += 1;
         }
     }
-    out
+    (out, kept)
 }
 
 fn placed<'a>(parts: &'a [Part<'_>]) -> impl Iterator<Item = (usize, Surfel)> + 'a {
@@ -148,7 +154,9 @@ mod tests {
     #[test]
     fn what_a_submap_before_shows_as_well_is_dropped_and_what_is_new_is_kept() {
         let wall = wall(false);
-        let merged = merge(&[at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)], &MergeSettings::default());
+        let (merged, kept) =
+            merge_counted(&[at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)], &MergeSettings::default());
+        assert_eq!(kept, [wall.len(), merged.len() - wall.len()]);
         // The second wall adds its right half.
         assert!((14_800..=15_200).contains(&merged.len()), "{}", merged.len());
         let alone = merge(&[at(&wall, 0.0, 0.005)], &MergeSettings::default());

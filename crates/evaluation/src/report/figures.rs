@@ -18,7 +18,7 @@ pub(super) struct Quality {
 pub(super) struct Figures {
     /// One alignment for all agents; views that were never mapped.
     pub protocol_h: Quality,
-    /// An alignment for each agent; views that the map was made from.
+    /// An alignment for each agent; views that the map was made from, of the refined map where there is one.
     pub protocol_p: Quality,
     pub tracking_per_frame_s: Option<f64>,
     pub mapping_per_frame_s: Option<f64>,
@@ -41,7 +41,7 @@ impl Figures {
             protocol_h: quality(joint.and_then(|joint| Some(joint.ate_m?.rmse)), report.pictures.held_out),
             protocol_p: quality(
                 trajectories.and_then(|scores| scores.mean_ate_p_m()),
-                report.pictures.training,
+                report.pictures.refined_training.or(report.pictures.training),
             ),
             tracking_per_frame_s: report.per_frame_s(TRACKING),
             mapping_per_frame_s: report.per_frame_s(MAPPING),

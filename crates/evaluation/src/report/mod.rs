@@ -85,6 +85,10 @@ pub struct Pictures {
     pub held_out: Option<PictureScores>,
     /// Protocol P: views that the map was made from.
     pub training: Option<PictureScores>,
+    /// As `held_out`, of the refined map.
+    pub refined_held_out: Option<PictureScores>,
+    /// As `training`, of the refined map.
+    pub refined_training: Option<PictureScores>,
 }
 
 /// The size of a map.

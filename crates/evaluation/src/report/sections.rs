@@ -61,7 +61,8 @@ fn figures(report: &Report) -> Section {
     same("map memory, MB", figures.map_bytes.map(|bytes| bytes as f64 * 1e-6), 2);
     same("bytes per frame between agents", figures.bytes_per_frame, 0);
     let note = "H: one rigid alignment for all agents together, every frame, views that were never mapped. \
-                P: an alignment for each agent (the mean over agents is shown), views that the map was made from.";
+                P: an alignment for each agent (the mean over agents is shown), views that the map was made from, of the \
+                refined map where there is one.";
     Section { title: "Figures", note: note.into(), table }
 }
 
@@ -237,6 +238,8 @@ fn pictures(report: &Report) -> Section {
     };
     row("held out (protocol H)", report.pictures.held_out);
     row("training (protocol P)", report.pictures.training);
+    row("held out, refined map", report.pictures.refined_held_out);
+    row("training, refined map", report.pictures.refined_training);
     Section { title: "Pictures", note: "Means over views.".into(), table }
 }
 

@@ -4,6 +4,7 @@ pub mod fuse;
 pub mod growth;
 pub mod inherit;
 pub mod optimise;
+pub mod refine;
 pub mod seed;
 pub mod ssim;
 pub mod submap;
