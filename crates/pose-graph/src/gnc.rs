@@ -126,8 +126,15 @@ pub enum Trust {
 
 /// Most rounds under the final cost; a few settle it.
 const POLISH_ROUNDS: u32 = 20;
-/// A loop in use is asked about only if its squared error is above this share of the limit.
+/// A loop in use is asked about only if its squared error is above this share of the limit,
 const STRAINED: f64 = 0.25;
+/// and only so many with the largest errors: each asks for a solve.
+const MOST_ASKED: usize = 100;
+/// A loop in use is given up when the others contradict it by this many times the limit: what is in must fail more
+/// clearly than what is out must fit, or true loops that lean on each other would be lost to the order of asking.
+const PARTING: f64 = 2.0;
+/// Loops that fail one by one, but by no more than this many times the limit, are once taken back together.
+const TOGETHER: f64 = 4.0;
 
 /// A solution with the weights that it was reached with.
 #[derive(Clone, Debug, PartialEq)]
@@ -186,28 +193,39 @@ pub fn solve(
     // Under the robust cost itself, for all that may be doubted, until nothing changes. What was left out is judged by
     // what taking it in would cost, not by the error that leaving it out has caused.
     let questioned: Vec<usize> = (0..trust.len()).filter(|&k| trust[k] != Trust::Full).collect();
+    let mut taken_together = robust.kernel != Kernel::TruncatedLeastSquares;
     for _ in 0..POLISH_ROUNDS {
         let mut next = weights.clone();
         let out: Vec<usize> = questioned.iter().copied().filter(|&k| !(weights[k] > 0.0)).collect();
         for &k in &questioned {
             next[k] = final_weight(robust.kernel, limit, squared(&solved.poses, k));
         }
-        if !out.is_empty() {
-            let innovations = solver.innovations(&solved.poses, &weights, &out)?;
-            for (&k, innovation) in out.iter().zip(innovations) {
-                next[k] = next[k].max(final_weight(robust.kernel, limit, innovation));
-            }
+        let innovations = solver.innovations(&solved.poses, &weights, &out)?;
+        for (&k, innovation) in out.iter().zip(&innovations) {
+            next[k] = next[k].max(final_weight(robust.kernel, limit, *innovation));
         }
         let changed = |next: &[f64]| next.iter().zip(&weights).any(|(a, b)| (a - b).abs() > 1e-3);
         if robust.kernel == Kernel::TruncatedLeastSquares && !changed(&next) {
             // A loop in use bends the graph towards itself: ask what the others say without it, and part with the
             // one that they contradict most.
-            let strained = |&k: &usize| weights[k] > 0.0 && squared(&solved.poses, k) > STRAINED * limit;
-            let strained: Vec<usize> = questioned.iter().copied().filter(strained).collect();
+            let error = |k: usize| squared(&solved.poses, k);
+            let mut strained: Vec<usize> = questioned
+                .iter()
+                .copied()
+                .filter(|&k| weights[k] > 0.0 && error(k) > STRAINED * limit)
+                .collect();
+            strained.sort_by(|&a, &b| error(b).total_cmp(&error(a)).then(a.cmp(&b)));
+            strained.truncate(MOST_ASKED);
             let without = solver.innovations(&solved.poses, &weights, &strained)?;
             let worst = strained.iter().zip(without).max_by(|(_, a), (_, b)| a.total_cmp(b));
-            if let Some((&k, _)) = worst.filter(|(_, squared)| *squared > limit) {
+            if let Some((&k, _)) = worst.filter(|(_, squared)| *squared > PARTING * limit) {
                 next[k] = 0.0;
+            }
+        }
+        if !taken_together && !changed(&next) {
+            taken_together = true;
+            for (&k, _) in out.iter().zip(&innovations).filter(|(_, squared)| **squared <= TOGETHER * limit) {
+                next[k] = 1.0;
             }
         }
         if !changed(&next) || !connected(problem, &next) {
