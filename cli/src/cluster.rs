@@ -27,7 +27,8 @@ impl LocalAgent {
             Some(_) => None,
             None => {
                 places.server = beside(places.server);
-                let handle = coma_place_recognition::Server::start(places).await.context("place-recognition")?;
+                let handle =
+                    coma_place_recognition::Server::start(places).await.context("place-recognition")?;
                 config.place_recognition = Some(handle.url.clone());
                 Some(handle)
             }
@@ -59,7 +60,12 @@ impl LocalAgent {
 
 /// A service for the agent in the same process: a free port on loopback, whatever the settings say of ports.
 fn beside(settings: ServerSettings) -> ServerSettings {
-    ServerSettings { listen: std::net::SocketAddr::from(([127, 0, 0, 1], 0)), token: None, tls: None, ..settings }
+    ServerSettings {
+        listen: std::net::SocketAddr::from(([127, 0, 0, 1], 0)),
+        token: None,
+        tls: None,
+        ..settings
+    }
 }
 
 /// Several agents that know one another.

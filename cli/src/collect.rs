@@ -62,7 +62,9 @@ impl AgentCalls {
             let at = At::Root("submaps");
             let at = at.index(i);
             let id: SubmapId = at.field("id").required(info.id.clone())?;
-            let Some(map_from_submap) = at.field("map_from_submap").optional(info.map_from_submap)? else { continue };
+            let Some(map_from_submap) = at.field("map_from_submap").optional(info.map_from_submap)? else {
+                continue;
+            };
             let request = v1::GetSubmapRequest { id: info.id };
             let mut stream = self.viewer.get_submap(request).await.map_err(plain)?.into_inner();
             let mut packed = Vec::new();
@@ -70,7 +72,8 @@ impl AgentCalls {
                 packed.extend_from_slice(&message.chunk);
             }
             let packed_bytes = packed.len() as u64;
-            let surfels = coma_surfel::pack::unpack(&packed, MAX_SURFELS).with_context(|| format!("submap {id}"))?;
+            let surfels =
+                coma_surfel::pack::unpack(&packed, MAX_SURFELS).with_context(|| format!("submap {id}"))?;
             out.push(Submap { id, map_from_submap, packed_bytes, surfels });
         }
         Ok(out)

@@ -41,12 +41,14 @@ pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
     };
     run::make_empty(&out)?;
     let world = if arguments.noise { "noisy-rooms" } else { "rooms" };
-    let specs = (0..arguments.agents).map(|i| format!("world:{world}/agent-{i}[0:{}]", arguments.frames)).collect();
+    let specs =
+        (0..arguments.agents).map(|i| format!("world:{world}/agent-{i}[0:{}]", arguments.frames)).collect();
     let mut run = Run::start(specs, &arguments.options, &out).await?;
-    let gateway = GatewayConfig { listen: arguments.listen, agents: run.cluster.urls(), ..GatewayConfig::default() };
-    let gateway = coma_viewer_gateway::Server::start(gateway)
-        .await
-        .with_context(|| format!("the page can't be served on {} (--listen takes another address)", arguments.listen))?;
+    let gateway =
+        GatewayConfig { listen: arguments.listen, agents: run.cluster.urls(), ..GatewayConfig::default() };
+    let gateway = coma_viewer_gateway::Server::start(gateway).await.with_context(|| {
+        format!("the page can't be served on {} (--listen takes another address)", arguments.listen)
+    })?;
     println!("watch the map grow: {}", gateway.url);
     run.finish(&arguments.options, &out).await?;
     if !arguments.exit {

@@ -47,11 +47,15 @@ pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
             stamps
         })
         .collect();
-    let texts: Vec<Vec<String>> = stamps.iter().map(|s| s.iter().map(|s| tum::stamp_text(*s)).collect()).collect();
+    let texts: Vec<Vec<String>> =
+        stamps.iter().map(|s| s.iter().map(|s| tum::stamp_text(*s)).collect()).collect();
     let results = gather::gather(&mut facts, &from_agents, &graph.unwrap_or_default(), &stamps)?;
     write_folder(&arguments.out, &facts, &results, &texts)?;
     for component in &facts.components {
-        println!("map {}: {} submaps, {} surfels, {}", component.name, component.submaps, component.surfels, component.map);
+        println!(
+            "map {}: {} submaps, {} surfels, {}",
+            component.name, component.submaps, component.surfels, component.map
+        );
     }
     Ok(())
 }

@@ -27,7 +27,8 @@ impl FromStr for Fault {
     type Err = anyhow::Error;
 
     fn from_str(text: &str) -> anyhow::Result<Self> {
-        let needed = "a fault is blackout:FIRST-LAST or nodepth:FIRST-LAST, frames counted from 0, both ends included";
+        let needed =
+            "a fault is blackout:FIRST-LAST or nodepth:FIRST-LAST, frames counted from 0, both ends included";
         let (kind, range) = text.split_once(':').context(needed)?;
         let kind = match kind {
             "blackout" => Kind::Blackout,
@@ -84,7 +85,8 @@ impl Sequence for Faulty {
             let (color, depth) = (&calibration.color, &calibration.depth);
             frame.depth = DepthBytes::Raw16(Image::filled(depth.width as usize, depth.height as usize, 0));
             if fault.kind == Kind::Blackout {
-                frame.color = ColorBytes::Rgb8(Image::filled(color.width as usize, color.height as usize, [0; 3]));
+                frame.color =
+                    ColorBytes::Rgb8(Image::filled(color.width as usize, color.height as usize, [0; 3]));
             }
         }
         Ok(frame)

@@ -1,8 +1,8 @@
-//! `coma inspect`: what a file holds, and what can be said of it.
+//! `coma inspect graph`: what a file holds, and what can be said of it.
 
 use crate::bench::sets;
 use anyhow::{Context, anyhow};
-use clap::{Args, Subcommand};
+use clap::Args;
 use coma_evaluation::{GraphPicture, graph_svg, percentile};
 use coma_geometry::Pose;
 use coma_pose_graph::certified::{self, Attempt, Start};
@@ -11,13 +11,6 @@ use coma_pose_graph::gnc::{self, RobustSettings, Trust};
 use coma_pose_graph::initialise::chordal;
 use coma_pose_graph::{Problem, SolverSettings};
 use std::path::PathBuf;
-
-/// What to look at.
-#[derive(Subcommand)]
-pub enum Inspect {
-    /// A pose graph (g2o): cost, residuals, weights, and whether its minimum is the global one.
-    Graph(GraphArguments),
-}
 
 /// Solves a pose graph from the file's own poses and says what came of it.
 #[derive(Args)]
@@ -39,23 +32,23 @@ pub struct GraphArguments {
 }
 
 /// Runs it.
-pub fn run(inspect: &Inspect) -> anyhow::Result<()> {
-    match inspect {
-        Inspect::Graph(arguments) => graph(arguments),
-    }
-}
-
-fn graph(arguments: &GraphArguments) -> anyhow::Result<()> {
+pub fn graph(arguments: &GraphArguments) -> anyhow::Result<()> {
     let (name, graph) = sets::whole(&arguments.file)?;
     let (problem, given) = graph.problem();
     let settings = SolverSettings::default();
     let odometry: Vec<bool> = graph.edges.iter().map(|e| e.from.abs_diff(e.to) == 1).collect();
     let loops = odometry.iter().filter(|o| !**o).count();
-    println!("{name}: {} poses, {} measurements, {loops} of them loops", problem.nodes, problem.constraints.len());
+    println!(
+        "{name}: {} poses, {} measurements, {loops} of them loops",
+        problem.nodes,
+        problem.constraints.len()
+    );
     let all = vec![1.0; problem.constraints.len()];
     println!("cost at the file's poses: {:.6}", problem.cost(&given, &all));
-    let weights = if arguments.robust { robust_weights(&problem, &given, &odometry, &settings)? } else { all };
-    let attempts = certified::solve(&problem, &given, &weights, &settings).context("the graph cannot be solved")?;
+    let weights =
+        if arguments.robust { robust_weights(&problem, &given, &odometry, &settings)? } else { all };
+    let attempts =
+        certified::solve(&problem, &given, &weights, &settings).context("the graph cannot be solved")?;
     for attempt in &attempts {
         print!("{}", said(attempt));
     }
@@ -104,7 +97,8 @@ fn robust_weights(
 ) -> anyhow::Result<Vec<f64>> {
     let trusted: Vec<f64> = odometry.iter().map(|o| if *o { 1.0 } else { 0.0 }).collect();
     // By odometry alone where it holds the graph: false loops would bend a start that they are part of.
-    let start = chordal(problem, given, &trusted).or_else(|_| chordal(problem, given, &vec![1.0; odometry.len()]))?;
+    let start =
+        chordal(problem, given, &trusted).or_else(|_| chordal(problem, given, &vec![1.0; odometry.len()]))?;
     let trust: Vec<Trust> = odometry.iter().map(|o| if *o { Trust::Full } else { Trust::Doubted }).collect();
     let solved = gnc::solve(problem, &start, &trust, &RobustSettings::default(), settings)?;
     let lost = solved.weights.iter().filter(|w| **w < 0.5).count();

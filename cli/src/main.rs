@@ -8,6 +8,7 @@ mod eval;
 mod export;
 mod fault;
 mod inspect;
+mod inspect_loops;
 mod play;
 mod progress;
 mod run;
@@ -42,15 +43,23 @@ enum Command {
     Gateway(serve::GatewayArguments),
     Stream(play::Arguments),
     Export(export::Arguments),
+    /// Shows what came of a run, and why.
+    #[command(subcommand)]
+    Inspect(Inspect),
     /// Writes synthetic data to disk.
     #[command(subcommand)]
     Synth(synth::Synth),
-    /// Says what a file holds.
-    #[command(subcommand)]
-    Inspect(inspect::Inspect),
     /// Measures one part and prints its figures.
     #[command(subcommand)]
     Bench(bench::Bench),
+}
+
+/// What to show.
+#[derive(Subcommand)]
+enum Inspect {
+    Loops(inspect_loops::Arguments),
+    /// A pose graph (g2o): cost, residuals, weights, and whether its minimum is the global one.
+    Graph(inspect::GraphArguments),
 }
 
 #[tokio::main]
@@ -67,8 +76,9 @@ async fn main() -> anyhow::Result<()> {
         Command::Gateway(arguments) => serve::gateway(arguments).await,
         Command::Stream(arguments) => play::run(arguments).await,
         Command::Export(arguments) => export::run(arguments).await,
+        Command::Inspect(Inspect::Loops(arguments)) => inspect_loops::run(&arguments),
+        Command::Inspect(Inspect::Graph(arguments)) => inspect::graph(&arguments),
         Command::Synth(synth) => synth::run(&synth),
-        Command::Inspect(inspect) => inspect::run(&inspect),
         Command::Bench(bench) => bench::run(&bench),
     }
 }
@@ -79,6 +89,7 @@ fn init_logging(command: &Command) -> anyhow::Result<()> {
         command,
         Command::Agent(_) | Command::PlaceRecognition(_) | Command::Dpgo(_) | Command::Gateway(_)
     );
-    let filter = std::env::var("RUST_LOG").unwrap_or_else(|_| if serves { "info".into() } else { "warn".into() });
+    let filter =
+        std::env::var("RUST_LOG").unwrap_or_else(|_| if serves { "info".into() } else { "warn".into() });
     Ok(coma_runtime::logging::init(&coma_runtime::LogSettings { filter, ..Default::default() })?)
 }

@@ -9,8 +9,11 @@ pub fn frames(name: &str, length: u64) -> ProgressBar {
 }
 
 fn bar(name: &str, length: u64, template: &str) -> ProgressBar {
-    let target =
-        if std::io::stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+    let target = if std::io::stderr().is_terminal() {
+        ProgressDrawTarget::stderr()
+    } else {
+        ProgressDrawTarget::hidden()
+    };
     let style = ProgressStyle::with_template(template).expect("the template is fixed").progress_chars("=> ");
     ProgressBar::with_draw_target(Some(length), target).with_style(style).with_prefix(name.to_owned())
 }

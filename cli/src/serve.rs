@@ -66,7 +66,8 @@ pub struct ServiceArguments {
 
 /// Runs a place-recognition service.
 pub async fn place_recognition(arguments: ServiceArguments) -> anyhow::Result<()> {
-    let mut config: PlaceRecognitionConfig = coma_runtime::load(arguments.config.as_deref(), "COMA_PLACE_RECOGNITION")?;
+    let mut config: PlaceRecognitionConfig =
+        coma_runtime::load(arguments.config.as_deref(), "COMA_PLACE_RECOGNITION")?;
     if let Some(listen) = arguments.listen {
         config.server.listen = listen;
     }

@@ -100,17 +100,25 @@ pub async fn stream(
 }
 
 /// Waits a little for an agent that is away; gives up when it was away for too long, or refuses what it is told.
-async fn wait(since: &mut Option<Instant>, options: &StreamOptions, error: anyhow::Error) -> anyhow::Result<()> {
+async fn wait(
+    since: &mut Option<Instant>,
+    options: &StreamOptions,
+    error: anyhow::Error,
+) -> anyhow::Result<()> {
     let refused = error.downcast_ref::<tonic::Status>().is_some_and(|status| {
         use tonic::Code::*;
-        matches!(status.code(), InvalidArgument | FailedPrecondition | Unauthenticated | PermissionDenied | OutOfRange)
+        matches!(
+            status.code(),
+            InvalidArgument | FailedPrecondition | Unauthenticated | PermissionDenied | OutOfRange
+        )
     });
     if refused {
         return Err(plain_error(error));
     }
     let begin = *since.get_or_insert_with(Instant::now);
     if begin.elapsed() > options.patience {
-        return Err(plain_error(error).context(format!("the agent was away for {:.0} s", options.patience.as_secs_f64())));
+        return Err(plain_error(error)
+            .context(format!("the agent was away for {:.0} s", options.patience.as_secs_f64())));
     }
     tokio::time::sleep(Duration::from_millis(300)).await;
     Ok(())
@@ -123,7 +131,7 @@ async fn open(
 ) -> anyhow::Result<u64> {
     let request = v1::OpenSessionRequest {
         session_id: options.session_id.clone(),
-        calibration: Some(calibration.clone()),
+        calibration: Some(*calibration),
         policy: options.policy.into(),
         clock_domain: v1::ClockDomain::Device.into(),
         hold_out_every: options.hold_out_every,
@@ -154,6 +162,10 @@ async fn play(
             };
             if let Some(fps) = rate_fps {
                 let due = Duration::from_secs_f64((index - from) as f64 / fps.max(1e-3));
+                #[allow(
+                    clippy::disallowed_methods,
+                    reason = "a thread that may block plays at the camera's pace"
+                )]
                 std::thread::sleep(due.saturating_sub(begin.elapsed()));
             }
             let message = v1::StreamFramesRequest { session_id: session_id.clone(), frame: Some(frame) };
@@ -185,14 +197,17 @@ async fn play(
                     }
                 }
                 if let Some(state) = ack.pose.map(|pose| pose.state()) {
-                    let message = if state == v1::TrackingState::Degraded { "tracking is degraded" } else { "" };
+                    let message =
+                        if state == v1::TrackingState::Degraded { "tracking is degraded" } else { "" };
                     progress.set_message(message);
                 } else {
                     progress.set_message("no pose");
                 }
             }
             Some(Event::Refusal(refusal)) => {
-                streamed.refused.push(format!("frame {}: {}: {}", refusal.sequence, refusal.field, refusal.message));
+                streamed
+                    .refused
+                    .push(format!("frame {}: {}: {}", refusal.sequence, refusal.field, refusal.message));
             }
             None => {}
         }

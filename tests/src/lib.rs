@@ -1,1 +1,3 @@
-//! coma-tests
+//! What scenarios of the cluster are told with; the scenarios themselves are below `tests/`.
+
+pub mod story;

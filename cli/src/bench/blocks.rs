@@ -60,7 +60,12 @@ struct Row {
 }
 
 /// Solves each set cut into each number of blocks, until the cost is within 0.1 % of the central one.
-pub fn run(files: &[PathBuf], counts: &[usize], arguments: &NetworkArguments, json: bool) -> anyhow::Result<()> {
+pub fn run(
+    files: &[PathBuf],
+    counts: &[usize],
+    arguments: &NetworkArguments,
+    json: bool,
+) -> anyhow::Result<()> {
     let mut rows = Vec::new();
     for file in files {
         rows.extend(set(file, counts, arguments)?);
@@ -135,8 +140,16 @@ fn table(rows: &[Row]) -> String {
         let _ = writeln!(
             out,
             "| {} | {} | {} | {:.6} | {excess} | {} | {} | {} | {:.1} | {:.1} | {} |",
-            r.set, r.blocks, r.loss, r.central_cost, rounds(r.rounds_to_1_percent), rounds(r.rounds_to_0_1_percent),
-            r.messages, r.bytes as f64 / 1e3, r.bytes_per_block as f64 / 1e3, r.spent.text()
+            r.set,
+            r.blocks,
+            r.loss,
+            r.central_cost,
+            rounds(r.rounds_to_1_percent),
+            rounds(r.rounds_to_0_1_percent),
+            r.messages,
+            r.bytes as f64 / 1e3,
+            r.bytes_per_block as f64 / 1e3,
+            r.spent.text()
         );
     }
     out

@@ -7,7 +7,8 @@ use clap::Args;
 use coma_pose_graph::certificate::{Certificate, certify};
 use coma_pose_graph::initialise::chordal;
 use coma_pose_graph::isotropic::objective;
-use coma_pose_graph::{Objective, Problem, Solver, SolverSettings};
+use coma_pose_graph::solver::Solver;
+use coma_pose_graph::{Objective, Problem, SolverSettings};
 use serde::Serialize;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -130,9 +131,21 @@ fn table(rows: &[Row]) -> String {
         let _ = writeln!(
             out,
             "| {} | {} | {} | {} | {} | {} | {:.6} | {:.6} | {:.6} | {:.6} | {} | {} | {} | {:.1e} | {} |",
-            r.set, r.poses, r.edges, r.chordal.text(), r.descent.text(), r.iterations, r.cost_at_start, r.cost,
-            r.isotropic_at_cost_minimum, r.isotropic, r.isotropic_descent.text(), r.isotropic_iterations,
-            r.certify.text(), r.smallest_eigenvalue / r.largest_eigenvalue, if r.certified { "yes" } else { "no" }
+            r.set,
+            r.poses,
+            r.edges,
+            r.chordal.text(),
+            r.descent.text(),
+            r.iterations,
+            r.cost_at_start,
+            r.cost,
+            r.isotropic_at_cost_minimum,
+            r.isotropic,
+            r.isotropic_descent.text(),
+            r.isotropic_iterations,
+            r.certify.text(),
+            r.smallest_eigenvalue / r.largest_eigenvalue,
+            if r.certified { "yes" } else { "no" }
         );
     }
     out

@@ -2,7 +2,13 @@
 
 mod blocks;
 mod clock;
+mod cpu;
+pub mod depth;
 pub mod graph;
+pub mod index;
+mod overlap;
+pub mod places;
+pub mod registration;
 pub mod robust;
 pub mod sets;
 pub mod tracking;
@@ -14,6 +20,10 @@ use clap::Subcommand;
 pub enum Bench {
     /// One agent alone: accuracy and time per frame.
     Tracking(tracking::Arguments),
+    Registration(registration::Arguments),
+    Places(places::Arguments),
+    Index(index::Arguments),
+    Depth(depth::Arguments),
     Graph(graph::Arguments),
     Robust(robust::Arguments),
 }
@@ -22,6 +32,10 @@ pub enum Bench {
 pub fn run(bench: &Bench) -> anyhow::Result<()> {
     match bench {
         Bench::Tracking(arguments) => tracking::run(arguments),
+        Bench::Registration(arguments) => registration::run(arguments),
+        Bench::Places(arguments) => places::run(arguments),
+        Bench::Index(arguments) => index::run(arguments),
+        Bench::Depth(arguments) => depth::run(arguments),
         Bench::Graph(arguments) => graph::run(arguments),
         Bench::Robust(arguments) => robust::run(arguments),
     }

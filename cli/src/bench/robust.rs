@@ -108,7 +108,13 @@ impl Clean {
         let squares: Vec<f64> = entries
             .edges
             .iter()
-            .map(|e| residual(&component.map_from_submap[&e.from], &component.map_from_submap[&e.to], &e.from_from_to))
+            .map(|e| {
+                residual(
+                    &component.map_from_submap[&e.from],
+                    &component.map_from_submap[&e.to],
+                    &e.from_from_to,
+                )
+            })
             .map(|e| e.fixed_rows::<3>(0).norm_squared())
             .collect();
         let residual_rms_m = (squares.iter().sum::<f64>() / squares.len() as f64).sqrt();
@@ -156,14 +162,19 @@ impl Clean {
             least = least.inf(&pose.translation.vector);
             most = most.sup(&pose.translation.vector);
         }
-        let mut pairs: BTreeSet<(SubmapId, SubmapId)> =
-            entries.edges.iter().flat_map(|e| [(e.from.clone(), e.to.clone()), (e.to.clone(), e.from.clone())]).collect();
+        let mut pairs: BTreeSet<(SubmapId, SubmapId)> = entries
+            .edges
+            .iter()
+            .flat_map(|e| [(e.from.clone(), e.to.clone()), (e.to.clone(), e.from.clone())])
+            .collect();
         let mut added = BTreeSet::new();
         while added.len() < count {
             let (from, map_from_from) = poses[random.random_range(0..poses.len())];
             let (to, map_from_to) = poses[random.random_range(0..poses.len())];
             let map_from_wrong = Pose::from_parts(
-                Translation3::from(Vector3::from_fn(|k, _| least[k] + random.random::<f64>() * (most[k] - least[k]))),
+                Translation3::from(Vector3::from_fn(|k, _| {
+                    least[k] + random.random::<f64>() * (most[k] - least[k])
+                })),
                 any_rotation(&mut random),
             );
             let information = entries.edges[random.random_range(0..self.entries.edges.len())].information;
@@ -213,8 +224,16 @@ fn table(rows: &[Row]) -> String {
         let _ = writeln!(
             out,
             "| {} | {} | {} | {} | {} | {rms} | {:.1} | {} | {} of {} | {} |",
-            r.set, r.share, r.seed, r.false_loops, r.components, r.clean_residual_rms_m * 1e3, r.false_used, r.true_used,
-            r.true_loops, r.solve.text()
+            r.set,
+            r.share,
+            r.seed,
+            r.false_loops,
+            r.components,
+            r.clean_residual_rms_m * 1e3,
+            r.false_used,
+            r.true_used,
+            r.true_loops,
+            r.solve.text()
         );
     }
     for group in rows.chunk_by(|a, b| (&a.set, a.share) == (&b.set, b.share)) {
@@ -222,8 +241,10 @@ fn table(rows: &[Row]) -> String {
         let _ = writeln!(
             out,
             "{} at {}: RMS at most 20 mm in {} of {}, at most 20 % of the clean residual in {}; no false loop used in {}; 90 % of the true used in {}",
-            group[0].set, group[0].share,
-            count(&|r| r.rms_m.is_some_and(|m| m <= 0.02)), group.len(),
+            group[0].set,
+            group[0].share,
+            count(&|r| r.rms_m.is_some_and(|m| m <= 0.02)),
+            group.len(),
             count(&|r| r.rms_m.is_some_and(|m| m <= 0.2 * r.clean_residual_rms_m)),
             count(&|r| r.false_used == 0),
             count(&|r| 10 * r.true_used >= 9 * r.true_loops)

@@ -81,7 +81,9 @@ fn one(source: Source, settings: &SlamSettings, arguments: &Arguments) -> anyhow
     let mut found: Vec<(usize, Pose)> = Vec::new();
     let (mut lost, mut degraded, mut submaps, mut surfels) = (0, 0, 0, 0);
     let (mut decode_s, mut track_s, mut map_s, mut totals_s) = (0.0, 0.0, 0.0, Vec::new());
-    let mut csv = String::from("frame,state,share,x,y,z,track_ms,map_ms,added,new_share,steps,hits,loss_l1,loss_ssim,loss_depth,gain,submap\n");
+    let mut csv = String::from(
+        "frame,state,share,x,y,z,track_ms,map_ms,added,new_share,steps,hits,loss_l1,loss_ssim,loss_depth,gain,submap\n",
+    );
     for index in 0..sequence.len() {
         let begin = Instant::now();
         let frame = Arc::new(coma_dataset::sequence::rgbd_frame(sequence, index)?);
@@ -119,8 +121,21 @@ fn one(source: Source, settings: &SlamSettings, arguments: &Arguments) -> anyhow
             writeln!(
                 csv,
                 "{index},{state:?},{:.4},{:.5},{:.5},{:.5},{:.1},{:.1},{},{:.4},{},{},{:.5},{:.4},{:.5},{:.4},{}",
-                outcome.share, t.x, t.y, t.z, (tracked - decoded) * 1e3, (mapped - tracked) * 1e3, m.added, m.new_share,
-                m.steps, m.hits, loss.color_l1, loss.ssim, loss.depth_l1_m, pose.brightness.gain, pose.submap.number
+                outcome.share,
+                t.x,
+                t.y,
+                t.z,
+                (tracked - decoded) * 1e3,
+                (mapped - tracked) * 1e3,
+                m.added,
+                m.new_share,
+                m.steps,
+                m.hits,
+                loss.color_l1,
+                loss.ssim,
+                loss.depth_l1_m,
+                pose.brightness.gain,
+                pose.submap.number
             )?;
         } else {
             writeln!(csv, "{index},{state:?}")?;
@@ -165,7 +180,8 @@ fn one(source: Source, settings: &SlamSettings, arguments: &Arguments) -> anyhow
 
 /// RMS and largest distance after rigid alignment, and RMS of the error of one step, metres.
 fn score(found: &[(usize, Pose)], truth: impl Fn(usize) -> Option<Pose>) -> Option<(f64, f64, f64)> {
-    let pairs: Vec<(usize, Pose, Pose)> = found.iter().filter_map(|(i, p)| Some((*i, *p, truth(*i)?))).collect();
+    let pairs: Vec<(usize, Pose, Pose)> =
+        found.iter().filter_map(|(i, p)| Some((*i, *p, truth(*i)?))).collect();
     let points = |f: fn(&(usize, Pose, Pose)) -> Pose| -> Vec<_> {
         pairs.iter().map(|p| f(p).translation.vector.into()).collect()
     };
@@ -195,8 +211,20 @@ fn table(rows: &[Row]) -> String {
         let _ = writeln!(
             out,
             "| {} | {} | {} | {} | {} | {} | {} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {} | {} |",
-            r.agent, r.frames, r.posed, r.lost, number(r.ate_rmse_cm), number(r.ate_max_cm), number(r.step_error_mm),
-            r.track_ms, r.map_ms, r.decode_ms, r.mean_ms, r.p95_ms, r.submaps, r.surfels
+            r.agent,
+            r.frames,
+            r.posed,
+            r.lost,
+            number(r.ate_rmse_cm),
+            number(r.ate_max_cm),
+            number(r.step_error_mm),
+            r.track_ms,
+            r.map_ms,
+            r.decode_ms,
+            r.mean_ms,
+            r.p95_ms,
+            r.submaps,
+            r.surfels
         );
     }
     out

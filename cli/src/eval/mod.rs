@@ -10,8 +10,8 @@ use crate::source::{self, Source};
 use anyhow::Context;
 use clap::Args;
 use coma_evaluation::{
-    AgentSummary, EdgeErrors, LoopCounts, LoopLine, MapSize, NormalisedErrors, Plots, Report, RunInfo, RunTrajectories,
-    StageTime, Times, Track, Traffic,
+    AgentSummary, EdgeErrors, LoopCounts, LoopLine, MapSize, NormalisedErrors, Plots, Report, RunInfo,
+    RunTrajectories, StageTime, Times, Track, Traffic,
 };
 use coma_geometry::{AgentId, Pose, StampNs, tum};
 use std::collections::{BTreeMap, BTreeSet};
@@ -59,14 +59,20 @@ pub async fn score(out: &Path, options: &Options) -> anyhow::Result<()> {
 }
 
 /// A run as it is read back.
-struct Read {
-    facts: Facts,
-    loops: Vec<LoopFacts>,
-    sources: Vec<Source>,
+pub struct Read {
+    /// What the run did.
+    pub facts: Facts,
+    /// Every candidate.
+    pub loops: Vec<LoopFacts>,
+    /// What the agents saw, in the order of the facts.
+    pub sources: Vec<Source>,
     faults: Vec<Vec<Fault>>,
     /// By agent, then component: frame and `map_from_camera`.
-    tracks: BTreeMap<(usize, usize), Vec<(usize, Pose)>>,
+    pub tracks: Tracks,
 }
+
+/// By agent, then component: frame and `map_from_camera`.
+pub type Tracks = BTreeMap<(usize, usize), Vec<(usize, Pose)>>;
 
 fn score_now(out: &Path, options: &Options) -> anyhow::Result<()> {
     let read = Read::open(out)?;
@@ -89,7 +95,12 @@ fn score_now(out: &Path, options: &Options) -> anyhow::Result<()> {
             started: Some(facts.started.clone()),
             finished: Some(facts.finished.clone()),
         },
-        agents: facts.agents.iter().enumerate().map(|(i, a)| summary(&read, i, a)).collect::<anyhow::Result<_>>()?,
+        agents: facts
+            .agents
+            .iter()
+            .enumerate()
+            .map(|(i, a)| summary(&read, i, a))
+            .collect::<anyhow::Result<_>>()?,
         trajectories: Some(evaluation.scores.clone()),
         pictures,
         map,
@@ -112,14 +123,16 @@ fn score_now(out: &Path, options: &Options) -> anyhow::Result<()> {
 }
 
 impl Read {
-    fn open(out: &Path) -> anyhow::Result<Self> {
+    /// Reads the folder that `coma run` wrote; the sequences must lie where they lay then.
+    pub fn open(out: &Path) -> anyhow::Result<Self> {
         let path = out.join("run.json");
         let text = std::fs::read_to_string(&path)
             .with_context(|| format!("{} is no run's folder: run.json can't be read", out.display()))?;
         let facts: Facts = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
         let path = out.join("loops.json");
         let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-        let loops: Vec<LoopFacts> = serde_json::from_str(&text).with_context(|| path.display().to_string())?;
+        let loops: Vec<LoopFacts> =
+            serde_json::from_str(&text).with_context(|| path.display().to_string())?;
         let mut opened = source::open(&facts.specs)?;
         let mut sources = Vec::new();
         for agent in &facts.agents {
@@ -165,11 +178,7 @@ impl Read {
 }
 
 /// Reads the trajectory files; every pose finds its frame by its stamp's text.
-fn tracks(
-    out: &Path,
-    facts: &Facts,
-    sources: &[Source],
-) -> anyhow::Result<BTreeMap<(usize, usize), Vec<(usize, Pose)>>> {
+fn tracks(out: &Path, facts: &Facts, sources: &[Source]) -> anyhow::Result<Tracks> {
     let mut tracks = BTreeMap::new();
     for (agent, known) in facts.agents.iter().enumerate() {
         let sequence = &sources[agent].sequence;
@@ -182,7 +191,8 @@ fn tracks(
             let poses = tum::parse(&text).with_context(shown)?;
             let of_frame = |p: &tum::StampedPose| {
                 let frame = frames.get(&p.stamp).copied();
-                let frame = frame.with_context(|| format!("{}: no frame has the stamp {}", shown(), p.stamp_text))?;
+                let frame =
+                    frame.with_context(|| format!("{}: no frame has the stamp {}", shown(), p.stamp_text))?;
                 anyhow::Ok((frame, p.pose))
             };
             let poses = poses.iter().map(of_frame).collect::<anyhow::Result<Vec<_>>>()?;
@@ -209,7 +219,9 @@ fn times(facts: &Facts) -> Times {
         for (stage, seconds) in &agent.frame_seconds {
             stages.entry(stage).or_default().extend(seconds);
         }
-        for (stage, seconds) in agent.stage_seconds.iter().filter(|(s, _)| !agent.frame_seconds.contains_key(*s)) {
+        for (stage, seconds) in
+            agent.stage_seconds.iter().filter(|(s, _)| !agent.frame_seconds.contains_key(*s))
+        {
             stages.entry(stage).or_default().push(*seconds);
         }
     }

@@ -26,7 +26,8 @@ pub fn score(read: &Read, out: &Path, options: &Options) -> anyhow::Result<(Pict
         Some(path) => Some(coma_encoder::Perceptual::open(path, &coma_encoder::RuntimeSettings::default())?),
         None => None,
     };
-    let maps: Vec<Option<SurfelCloud>> = read.facts.components.iter().map(|c| map(out, &c.map)).collect::<Result<_, _>>()?;
+    let maps: Vec<Option<SurfelCloud>> =
+        read.facts.components.iter().map(|c| map(out, &c.map)).collect::<Result<_, _>>()?;
     let plan = plan(read, options.views);
     let bar = progress::steps("rendering", plan.len() as u64);
     let renders = out.join("renders");
@@ -50,7 +51,11 @@ pub fn score(read: &Read, out: &Path, options: &Options) -> anyhow::Result<(Pict
             View { color: &recorded, depth_m: &frame.depth_m },
             distance,
         )?;
-        if view.held_out { held_out.push(score) } else { training.push(score) }
+        if view.held_out {
+            held_out.push(score)
+        } else {
+            training.push(score)
+        }
         if view.shown {
             let name = format!("{}-{:06}.png", source.agent, view.frame);
             let path = renders.join(&name);
@@ -97,7 +102,8 @@ fn plan(read: &Read, views: usize) -> Vec<Planned> {
             .flat_map(|((_, component), poses)| poses.iter().map(|(frame, pose)| (*component, *frame, *pose)))
             .collect();
         for held_out in [true, false] {
-            let kind: Vec<_> = poses.iter().filter(|p| is_held_out(&read.facts, agent, p.1) == held_out).collect();
+            let kind: Vec<_> =
+                poses.iter().filter(|p| is_held_out(&read.facts, agent, p.1) == held_out).collect();
             let picked = spread(kind.len(), views);
             let shown: BTreeSet<usize> = spread(picked.len(), SHOWN).into_iter().map(|i| picked[i]).collect();
             out.extend(picked.iter().map(|i| {
@@ -144,7 +150,12 @@ fn beside(frame: &RgbdFrame, rendering: &Rendering) -> RgbImage {
         for (column, picture) in pictures.iter().enumerate() {
             let bytes = picture.to_bytes();
             let part = RgbImage::from_fn(width, height, |x, y| image::Rgb(bytes[(x as usize, y as usize)]));
-            imageops::replace(&mut out, &part, i64::from(column as u32 * width), i64::from(row as u32 * height));
+            imageops::replace(
+                &mut out,
+                &part,
+                i64::from(column as u32 * width),
+                i64::from(row as u32 * height),
+            );
         }
     }
     out

@@ -15,10 +15,18 @@ pub fn text(graph: &v1::GetGraphResponse, entries: &[(EntryKey, Payload)]) -> an
         poses.insert(id, at.field("map_from_submap").required(pose.map_from_submap)?);
     }
     let number: BTreeMap<&SubmapId, u64> = poses.keys().zip(0..).collect();
-    let mut out = G2oGraph { vertices: poses.values().copied().zip(0..).map(|(p, i)| (i, p)).collect(), ..G2oGraph::default() };
+    let mut out = G2oGraph {
+        vertices: poses.values().copied().zip(0..).map(|(p, i)| (i, p)).collect(),
+        ..G2oGraph::default()
+    };
     let mut edge = |from: &SubmapId, to: &SubmapId, from_from_to: &Pose, information: &Matrix6| {
         if let (Some(from), Some(to)) = (number.get(from), number.get(to)) {
-            out.edges.push(G2oEdge { from: *from, to: *to, from_from_to: *from_from_to, information: *information });
+            out.edges.push(G2oEdge {
+                from: *from,
+                to: *to,
+                from_from_to: *from_from_to,
+                information: *information,
+            });
         }
     };
     for (_, payload) in entries {

@@ -106,8 +106,12 @@ pub fn gather(
                     LoopOutcome::Accepted { from_from_to, information, numbers } => {
                         line.verdict = "accepted".into();
                         line.numbers = numbers.clone();
-                        line.edge =
-                            Some(EdgeFacts { from, to, from_from_to: *from_from_to, information: *information });
+                        line.edge = Some(EdgeFacts {
+                            from,
+                            to,
+                            from_from_to: *from_from_to,
+                            information: *information,
+                        });
                         if let Some(message) = withdrawn.get(key) {
                             line.verdict = "withdrawn".into();
                             line.message = Some((*message).to_owned());
@@ -176,7 +180,12 @@ fn components(
         let generation = component.generation.clone().unwrap_or_default();
         let map_id = generation.map_id.unwrap_or_default();
         facts.components.push(ComponentFacts {
-            name: format!("{}/{} from {}", map_id.agent_id, map_id.epoch, ids.first().map_or(String::new(), |id| id.to_string())),
+            name: format!(
+                "{}/{} from {}",
+                map_id.agent_id,
+                map_id.epoch,
+                ids.first().map_or(String::new(), |id| id.to_string())
+            ),
             digest: generation.digest.iter().map(|b| format!("{b:02x}")).collect(),
             submaps: ids.len(),
             cost: component.cost,
@@ -190,7 +199,11 @@ fn components(
 }
 
 /// Frame of every submap's anchor, by its stamp.
-fn anchors(facts: &Facts, entries: &[(EntryKey, Payload)], stamps: &[Vec<StampNs>]) -> BTreeMap<SubmapId, usize> {
+fn anchors(
+    facts: &Facts,
+    entries: &[(EntryKey, Payload)],
+    stamps: &[Vec<StampNs>],
+) -> BTreeMap<SubmapId, usize> {
     let mut out = BTreeMap::new();
     for (_, payload) in entries {
         let Payload::SubmapOpened(opened) = payload else { continue };

@@ -135,8 +135,11 @@ impl Run {
     pub async fn finish(&mut self, options: &Options, out: &Path) -> anyhow::Result<()> {
         let (begin, cpu) = (Instant::now(), cpu_seconds());
         self.facts.started = rfc3339(SystemTime::now());
-        let stamps: Vec<Vec<StampNs>> =
-            self.sources.iter().map(|s| (0..s.sequence.len()).map(|i| s.sequence.stamp(i)).collect()).collect();
+        let stamps: Vec<Vec<StampNs>> = self
+            .sources
+            .iter()
+            .map(|s| (0..s.sequence.len()).map(|i| s.sequence.stamp(i)).collect())
+            .collect();
         let texts: Vec<Vec<String>> = self
             .sources
             .iter()
@@ -149,7 +152,8 @@ impl Run {
         }
         let settings = coma_runtime::ClientSettings::default();
         let urls = self.cluster.urls();
-        let mut calls = urls.iter().map(|url| AgentCalls::new(url, &settings)).collect::<anyhow::Result<Vec<_>>>()?;
+        let mut calls =
+            urls.iter().map(|url| AgentCalls::new(url, &settings)).collect::<anyhow::Result<Vec<_>>>()?;
         let spinner = progress::spinner("verifying");
         collect::drain(&mut calls, |text| spinner.set_message(text.to_owned())).await?;
         spinner.finish_and_clear();
@@ -164,7 +168,11 @@ impl Run {
         let graph = calls.first_mut().context("no agents")?.graph().await?;
         let results = gather::gather(&mut self.facts, &from_agents, &graph, &stamps)?;
         folder::write(out, &self.facts, &results, &texts)?;
-        eval::score(out, &eval::Options { lpips_model: options.lpips_model.clone(), ..eval::Options::default() }).await
+        eval::score(
+            out,
+            &eval::Options { lpips_model: options.lpips_model.clone(), ..eval::Options::default() },
+        )
+        .await
     }
 
     async fn stream_all(&mut self, options: &Options) -> anyhow::Result<Vec<Streamed>> {
@@ -174,8 +182,14 @@ impl Run {
             let bar = bars.add(progress::frames(&source.agent, source.sequence.len() as u64));
             source.sequence = fault::spoil(source.sequence, &self.faults[i]);
             let url = self.cluster.agents[i].agent.url.clone();
-            let channel = channel(&url, &coma_runtime::ClientSettings::default(), &ByteLedger::default(), Class::Client)?;
-            let stream_options = StreamOptions { hold_out_every: options.hold_out, ..StreamOptions::default() };
+            let channel = channel(
+                &url,
+                &coma_runtime::ClientSettings::default(),
+                &ByteLedger::default(),
+                Class::Client,
+            )?;
+            let stream_options =
+                StreamOptions { hold_out_every: options.hold_out, ..StreamOptions::default() };
             tasks.spawn(async move {
                 let agent = source.agent.clone();
                 let streamed = stream(source, channel, &stream_options, &bar).await;
@@ -283,6 +297,8 @@ mod tests {
         let names = ["a".to_owned(), "b".to_owned()];
         let found = faults(&["b=nodepth:1-2".into(), "blackout:5-6".into()], &names).unwrap();
         assert_eq!((found[0].len(), found[1].len()), (1, 2));
-        assert!(faults(&["c=nodepth:1-2".into()], &names).unwrap_err().to_string().contains("there are a, b"));
+        assert!(
+            faults(&["c=nodepth:1-2".into()], &names).unwrap_err().to_string().contains("there are a, b")
+        );
     }
 }

@@ -58,7 +58,12 @@ const AREA_M2: f64 = std::f64::consts::PI * NEAR_M * NEAR_M / 20.0;
 pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let graph = graph(&arguments.team)?;
     std::fs::write(&arguments.out, graph.to_text()).with_context(|| arguments.out.display().to_string())?;
-    println!("{}: {} submaps, {} measurements", arguments.out.display(), graph.vertices.len(), graph.edges.len());
+    println!(
+        "{}: {} submaps, {} measurements",
+        arguments.out.display(),
+        graph.vertices.len(),
+        graph.edges.len()
+    );
     Ok(())
 }
 

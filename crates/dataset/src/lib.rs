@@ -18,5 +18,5 @@ pub mod world;
 
 pub use error::DatasetError;
 pub use sequence::{Calibration, ColorBytes, DepthBytes, RawFrame, Sequence};
-pub use spec::{Format, Spec, SpecError, open, open_all};
+pub use spec::{Format, NamedSequence, Spec, SpecError, open, open_all};
 pub use synth::write_tum;

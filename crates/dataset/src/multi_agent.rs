@@ -20,7 +20,10 @@ pub(crate) fn agent_folders(folder: &Path) -> Result<Vec<PathBuf>, DatasetError>
     // agent_10 comes after agent_9: shorter names first.
     out.sort_by_key(|p| (p.as_os_str().len(), p.clone()));
     if out.is_empty() {
-        return Err(DatasetError::damaged(folder, "holds no agent folders (agent_*/results or *_part*/results)"));
+        return Err(DatasetError::damaged(
+            folder,
+            "holds no agent folders (agent_*/results or *_part*/results)",
+        ));
     }
     Ok(out)
 }

@@ -8,8 +8,7 @@ use coma_geometry::{Distortion, Intrinsics, Pose, tum};
 use std::path::Path;
 
 /// The data set's published camera; colour and depth are used as if registered, as is usual.
-const CAMERA: Intrinsics =
-    Intrinsics { width: 640, height: 480, fx: 585.0, fy: 585.0, cx: 320.0, cy: 240.0 };
+const CAMERA: Intrinsics = Intrinsics { width: 640, height: 480, fx: 585.0, fy: 585.0, cx: 320.0, cy: 240.0 };
 const FRAMES_PER_SECOND: f64 = 30.0;
 
 pub(crate) fn open(folder: &Path) -> Result<FileSequence, DatasetError> {

@@ -174,9 +174,12 @@ pub fn open(spec: &Spec) -> Result<Box<dyn Sequence>, DatasetError> {
     restrict(spec, whole)
 }
 
+/// An agent's name and what it sees.
+pub type NamedSequence = (String, Box<dyn Sequence>);
+
 /// Opens every agent that a spec names: one for a single sequence, one per folder for a multi-agent
 /// folder. Names are the spec's (with `-0`, `-1`, ... where there are several), else the folder's.
-pub fn open_all(spec: &Spec) -> Result<Vec<(String, Box<dyn Sequence>)>, DatasetError> {
+pub fn open_all(spec: &Spec) -> Result<Vec<NamedSequence>, DatasetError> {
     let camera = match spec.format {
         Format::ReplicaMultiAgent => &replica::REPLICA,
         Format::AriaMultiAgent => &replica::ARIA,

@@ -74,9 +74,9 @@ fn calibration(path: &Path, text: &str) -> Result<(Intrinsics, f64), DatasetErro
 /// A path inside the sequence's folder, as its lists name it.
 fn inside(folder: &Path, list: &Path, line: usize, name: &str) -> Result<PathBuf, DatasetError> {
     let relative = Path::new(name);
-    let plain = relative.components().all(|c| {
-        matches!(c, std::path::Component::Normal(_) | std::path::Component::CurDir)
-    });
+    let plain = relative
+        .components()
+        .all(|c| matches!(c, std::path::Component::Normal(_) | std::path::Component::CurDir));
     if !plain {
         let reason = format!("line {line}: {:?} does not lie inside the sequence's folder", cut(name));
         return Err(DatasetError::damaged(list, reason));
@@ -174,7 +174,8 @@ fn matched(folder: &Path) -> Result<Vec<FrameFiles>, DatasetError> {
 fn nearest<T>(sorted: &[T], stamp: StampNs, key: impl Fn(&T) -> StampNs) -> Option<&T> {
     let after = sorted.partition_point(|t| key(t) < stamp);
     let difference = |t: &&T| (key(t).0 as i128 - stamp.0 as i128).abs();
-    let best = sorted[after.saturating_sub(1)..(after + 1).min(sorted.len())].iter().min_by_key(difference)?;
+    let best =
+        sorted[after.saturating_sub(1)..(after + 1).min(sorted.len())].iter().min_by_key(difference)?;
     (difference(&best) <= MAX_DIFFERENCE_NS as i128).then_some(best)
 }
 

@@ -174,7 +174,8 @@ fn nearly_every_view_fixes_all_six_degrees_of_freedom_and_is_textured() {
 
 #[test]
 fn the_same_seed_gives_the_same_bytes_and_another_seed_other_ones() {
-    let small = WorldSettings { width: 64, height: 48, noise: Some(SensorNoise::default()), ..Default::default() };
+    let small =
+        WorldSettings { width: 64, height: 48, noise: Some(SensorNoise::default()), ..Default::default() };
     let frame = |settings| World::new(settings).unwrap().sequence(1).unwrap().frame(17).unwrap();
     let first = frame(small);
     assert_eq!(first, frame(WorldSettings { agents: 3, frames: 90, ..small }));

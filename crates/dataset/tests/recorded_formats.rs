@@ -115,8 +115,11 @@ fn replica_agent(folder: &Path, frames: usize) {
     let mut rows = String::new();
     for i in 0..frames {
         let stamp = film.stamp_text(i);
-        fs::copy(tum.path().join(format!("rgb/{stamp}.png")), folder.join(format!("results/frame{i:06}.png")))
-            .unwrap();
+        fs::copy(
+            tum.path().join(format!("rgb/{stamp}.png")),
+            folder.join(format!("results/frame{i:06}.png")),
+        )
+        .unwrap();
         let depth = tum.path().join(format!("depth/{stamp}.png"));
         fs::copy(depth, folder.join(format!("results/depth{i:06}.png"))).unwrap();
         let matrix = film.truth(i).unwrap().to_homogeneous().transpose();
@@ -128,7 +131,8 @@ fn replica_agent(folder: &Path, frames: usize) {
 }
 
 fn camera_file(folder: &Path) {
-    let text = r#"{"camera": {"w": 64, "h": 48, "fx": 52.0, "fy": 52.0, "cx": 31.5, "cy": 23.5, "scale": 5000}}"#;
+    let text =
+        r#"{"camera": {"w": 64, "h": 48, "fx": 52.0, "fy": 52.0, "cx": 31.5, "cy": 23.5, "scale": 5000}}"#;
     fs::write(folder.join("cam_params.json"), text).unwrap();
 }
 
@@ -176,9 +180,10 @@ fn replica_needs_a_pose_for_every_frame_and_a_depth_for_every_color() {
 fn seven_scenes_frames_are_found_by_name() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let (color, depth) = (image::RgbImage::new(640, 480), image::ImageBuffer::from_fn(640, 480, |x, _| {
-        image::Luma([if x == 0 { 65535u16 } else { 1500 }])
-    }));
+    let (color, depth) = (
+        image::RgbImage::new(640, 480),
+        image::ImageBuffer::from_fn(640, 480, |x, _| image::Luma([if x == 0 { 65535u16 } else { 1500 }])),
+    );
     color.save(at.join("frame-000007.color.png")).unwrap();
     depth.save(at.join("frame-000007.depth.png")).unwrap();
     fs::write(at.join("frame-000007.pose.txt"), "1 0 0 1\n0 1 0 2\n0 0 1 3\n0 0 0 1\n").unwrap();

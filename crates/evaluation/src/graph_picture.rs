@@ -85,8 +85,7 @@ fn draw(
 fn seen(points: &[[f64; 3]]) -> ((usize, usize), (&'static str, &'static str)) {
     let reach = |axis: usize| {
         let values = points.iter().map(|p| p[axis]);
-        let (least, most) =
-            values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
+        let (least, most) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), v| (a.min(v), b.max(v)));
         most - least
     };
     let hidden = (0..3).min_by(|a, b| reach(*a).total_cmp(&reach(*b))).unwrap_or(2);

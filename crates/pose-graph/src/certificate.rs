@@ -294,13 +294,20 @@ mod tests {
         assert!(certificate.holds(), "{certificate:?}");
         assert!((certificate.objective - cost).abs() < 1e-6 * cost);
         let wound: Vec<Pose> = (0..24)
-            .map(|k| se3::exp(&Tangent::from_fn(|i, _| f64::from(i == 5) * k as f64 * std::f64::consts::TAU / 24.0)))
+            .map(|k| {
+                se3::exp(&Tangent::from_fn(|i, _| {
+                    f64::from(i == 5) * k as f64 * std::f64::consts::TAU / 24.0
+                }))
+            })
             .collect();
         let (worse, poses) = minimum(&problem, &wound);
         assert!(worse > 2.0 * cost, "{worse} {cost}");
         let certificate = certify(&problem, &poses, &weights).unwrap();
         assert!(certificate.stationarity < 1e-3, "{certificate:?}");
-        assert!(!certificate.holds() && certificate.smallest < -1e-3 * certificate.largest, "{certificate:?}");
+        assert!(
+            !certificate.holds() && certificate.smallest < -1e-3 * certificate.largest,
+            "{certificate:?}"
+        );
     }
 
     #[test]

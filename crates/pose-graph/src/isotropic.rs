@@ -93,10 +93,8 @@ const NEWTON_TRACE: f64 = 1.5;
 /// The isotropic objective; `weights` is one per constraint.
 pub fn objective(constraints: &[Constraint], poses: &[Pose], weights: &[f64]) -> f64 {
     let used = constraints.iter().zip(weights).filter(|(_, w)| **w > 0.0);
-    used.map(|(c, w)| {
-        w * Isotropic::of(&c.information).term(&poses[c.from], &poses[c.to], &c.from_from_to)
-    })
-    .sum()
+    used.map(|(c, w)| w * Isotropic::of(&c.information).term(&poses[c.from], &poses[c.to], &c.from_from_to))
+        .sum()
 }
 
 /// What one measurement adds to the normal equations.
@@ -153,7 +151,10 @@ mod tests {
             let f = |a: &Pose, b: &Pose| weight.term(a, b, &measured);
             let by_i = (f(&(i * plus), &j) - f(&(i * minus), &j)) / (2.0 * step);
             let by_j = (f(&i, &(j * plus)) - f(&i, &(j * minus))) / (2.0 * step);
-            assert!((normal.g_i[axis] - by_i).abs() < 1e-6 && (normal.g_j[axis] - by_j).abs() < 1e-6, "{axis}");
+            assert!(
+                (normal.g_i[axis] - by_i).abs() < 1e-6 && (normal.g_j[axis] - by_j).abs() < 1e-6,
+                "{axis}"
+            );
             // Without an error the gradient is zero, and the Hessian has one meaning.
             let gradient = |a: &Pose, b: &Pose| weight.normal(a, b, &exact);
             let (up, down) = (gradient(&(i * plus), &j), gradient(&(i * minus), &j));
@@ -180,8 +181,16 @@ mod tests {
             let middle = f(&i, &j);
             let by_i = (f(&(i * plus), &j) + f(&(i * minus), &j) - 2.0 * middle) / (step * step);
             let by_j = (f(&i, &(j * plus)) + f(&i, &(j * minus)) - 2.0 * middle) / (step * step);
-            assert!((normal.ii[(axis, axis)] - by_i).abs() < 1e-3, "{axis}: {} {by_i}", normal.ii[(axis, axis)]);
-            assert!((normal.jj[(axis, axis)] - by_j).abs() < 1e-3, "{axis}: {} {by_j}", normal.jj[(axis, axis)]);
+            assert!(
+                (normal.ii[(axis, axis)] - by_i).abs() < 1e-3,
+                "{axis}: {} {by_i}",
+                normal.ii[(axis, axis)]
+            );
+            assert!(
+                (normal.jj[(axis, axis)] - by_j).abs() < 1e-3,
+                "{axis}: {} {by_j}",
+                normal.jj[(axis, axis)]
+            );
         }
     }
 }

@@ -1,8 +1,8 @@
 //! Previews: what a new measurement does to the last result, within milliseconds. They start from the last solution and
 //! are provisional: what is published is always the cold solve of [`crate::global`].
 
-use crate::gnc::final_weight;
 use crate::global::GlobalSettings;
+use crate::gnc::final_weight;
 use crate::graph::{Edge, EdgeKind, EntryProblem, GraphEntries, UsableGraph, checked_edge};
 use crate::residual::{residual, squared_mahalanobis};
 use crate::solution::Component;

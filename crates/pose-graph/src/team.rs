@@ -84,7 +84,8 @@ pub fn entries(
         let submap = SubmapId { agent, epoch: Epoch(0), number: *number };
         *number += 1;
         // What odometry says is not in the files.
-        let node = NodeInfo { first_frame: FRAMES_APART * number_of(*id), agent_from_submap: Pose::identity() };
+        let node =
+            NodeInfo { first_frame: FRAMES_APART * number_of(*id), agent_from_submap: Pose::identity() };
         entries.nodes.insert(submap.clone(), node);
         submaps.insert(*id, submap);
     }
@@ -153,7 +154,8 @@ mod tests {
         let sure = information_of(0.1, 0.2);
         let (entries, vertices) = super::entries(&parts, Believed::Consecutive, Some(sure)).unwrap();
         assert_eq!(vertices.values().copied().collect::<Vec<_>>(), [a0, a1, b0]);
-        let kinds: Vec<_> = entries.edges.iter().map(|e| (e.kind, e.from.to_string(), e.to.to_string())).collect();
+        let kinds: Vec<_> =
+            entries.edges.iter().map(|e| (e.kind, e.from.to_string(), e.to.to_string())).collect();
         assert_eq!(kinds.len(), 2);
         assert_eq!((kinds[0].0, kinds[1].0), (EdgeKind::Odometry, EdgeKind::Loop));
         assert!((entries.edges[0].information[(3, 3)] - 25.0).abs() < 1e-12);

@@ -3,10 +3,10 @@
 mod world;
 
 use coma_geometry::Pose;
+use coma_pose_graph::SolverSettings;
 use coma_pose_graph::blocks::{BlockSettings, Network, Simulation, blocks};
 use coma_pose_graph::g2o::{G2oGraph, G2oLimits};
 use coma_pose_graph::initialise::chordal;
-use coma_pose_graph::SolverSettings;
 use world::shared_data;
 
 #[test]
@@ -57,18 +57,23 @@ fn probe() {
                 if let Some(poses) = poses {
                     let excess = problem.cost(&poses, &weights) / central.cost - 1.0;
                     let r = simulation.rounds();
-                    if r.is_power_of_two() || r % 100 == 0 {
+                    if r.is_power_of_two() || r.is_multiple_of(100) {
                         line += &format!(" {r}:{excess:.1e}");
                     }
                     if excess < 1e-3 && reached.is_none() {
                         reached = Some((r, simulation.traffic));
-                        if std::env::var("ON").is_err() { break; }
+                        if std::env::var("ON").is_err() {
+                            break;
+                        }
                     }
                 }
             }
             println!(
                 "{name} {count} relax {relax} loss {loss} cost {}: {reached:?} settled {} {:?} {:.1} s | {line}",
-                central.cost, simulation.is_settled(), simulation.traffic, clock.elapsed().as_secs_f64()
+                central.cost,
+                simulation.is_settled(),
+                simulation.traffic,
+                clock.elapsed().as_secs_f64()
             );
         }
     }

@@ -2,9 +2,9 @@
 
 mod world;
 
+use coma_geometry::se3;
 use coma_pose_graph::preview::{Added, Preview};
 use coma_pose_graph::{GlobalSettings, GraphEntries, solve};
-use coma_geometry::se3;
 use std::time::Instant;
 use world::World;
 

@@ -69,7 +69,10 @@ fn is_certified(name: &str, objective: f64) {
     let weights = vec![1.0; problem.constraints.len()];
     let start = chordal(&problem, &start, &weights).unwrap();
     let end = attempt(&problem, Start::Chordal, &start, &weights, &SolverSettings::default()).unwrap();
-    println!("{name}: {} in {} iterations, {:?}", end.isotropic.cost, end.isotropic.iterations, end.certificate);
+    println!(
+        "{name}: {} in {} iterations, {:?}",
+        end.isotropic.cost, end.isotropic.iterations, end.certificate
+    );
     assert!((end.isotropic.cost / objective - 1.0).abs() < 1e-4, "{}", end.isotropic.cost);
     assert!((end.certificate.objective / objective - 1.0).abs() < 1e-4);
     assert!(end.certificate.holds(), "{:?}", end.certificate);
@@ -91,7 +94,10 @@ fn the_torus_from_its_own_vertices_is_refused_and_solved_from_another_start() {
     let weights = vec![1.0; problem.constraints.len()];
     let attempts = certified::solve(&problem, &start, &weights, &SolverSettings::default()).unwrap();
     for a in &attempts {
-        println!("{:?}: cost {}, isotropic {}, {:?}", a.start, a.solved.cost, a.isotropic.cost, a.certificate);
+        println!(
+            "{:?}: cost {}, isotropic {}, {:?}",
+            a.start, a.solved.cost, a.isotropic.cost, a.certificate
+        );
     }
     let [first, second] = &attempts[..] else { panic!("one attempt was enough") };
     assert!(!first.certificate.holds() && first.isotropic.cost > 1.1 * 24227.09);

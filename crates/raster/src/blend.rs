@@ -1,146 +1,201 @@
-//! Front-to-back blending of one tile (eq. 3), 16 pixels at a time.
+//! Front-to-back blending of one tile (eq. 3), block by block: a block's sums stay in registers while its
+//! surfels pass by, and a block whose pixels are done stops.
 
-use crate::exp::exp_neg;
+use crate::hit::{Constants, Hits, TilePixels};
+use crate::lanes::Lanes;
 use crate::project::Projected;
 use crate::settings::ObservedTile;
-use crate::{ALPHA_MAX, LANES, RenderSettings, TILE};
+use crate::tiles::Entry;
+use crate::{BLOCKS, LANES, RenderSettings, TILE};
 use coma_geometry::Intrinsics;
-use multiversion::multiversion;
+use pulp::{Simd, WithSimd};
 
-/// Sums over the blend, one lane per pixel.
+/// One number for each pixel of a tile, block by block. `[block, row, column]`
+pub(crate) type TileImage = [f32; TILE * TILE];
+
+/// A blended tile.
 pub(crate) struct TileImages {
-    pub color: [[f32; LANES]; 3],
-    pub depth: [f32; LANES],
-    pub depth_squared: [f32; LANES],
-    pub median: [f32; LANES],
-    pub opacity: [f32; LANES],
-    pub normal: [[f32; LANES]; 3],
+    pub color: [TileImage; 3],
+    /// Expected depth.
+    pub depth: TileImage,
+    pub opacity: TileImage,
+    pub median: TileImage,
+    pub spread: TileImage,
+    /// Unit length, or zero.
+    pub normal: [TileImage; 3],
     /// Over 0 where a surfel lies near the observed depth.
-    pub near: [f32; LANES],
+    pub near: TileImage,
     pub hits: u64,
 }
 
-/// What one surfel does to 16 pixels of a row.
-pub(crate) struct RowHits {
-    pub alpha: [f32; TILE],
-    pub depth: [f32; TILE],
-}
-
-/// The rows of a tile (`y0..`) that a surfel touches.
-#[inline(always)]
-pub(crate) fn rows(p: &Projected, y0: f32) -> std::ops::Range<usize> {
-    let first = (p.bounds[1] - y0 as i32).max(0) as usize;
-    let last = (p.bounds[3] - y0 as i32 + 1).clamp(0, TILE as i32) as usize;
-    first..last
-}
-
-/// Alpha (0 below the least) and depth of a surfel along one row of a tile.
-#[inline(always)]
-pub(crate) fn row_hits(p: &Projected, x0: f32, y: f32, camera: &CameraF32, settings: &RenderSettings) -> RowHits {
-    let mut out = RowHits { alpha: [0.0; TILE], depth: [0.0; TILE] };
-    let dy = (y - camera.cy) * camera.inv_fy;
-    let base = |v: &[f32; 3]| v[1] * dy + v[2];
-    let (au, bu, nu) = (base(&p.a), base(&p.b), base(&p.n));
-    let low_pass = 1.0 / (settings.low_pass_px * settings.low_pass_px);
-    let py = (y - p.pixel[1]) * (y - p.pixel[1]);
-    for lane in 0..TILE {
-        let x = x0 + lane as f32;
-        let dx = (x - camera.cx) * camera.inv_fx;
-        let inv = 1.0 / (p.n[0] * dx + nu);
-        let u = (p.a[0] * dx + au) * inv;
-        let v = (p.b[0] * dx + bu) * inv;
-        let z = p.k * inv;
-        let on_plane = u * u + v * v;
-        let on_screen = ((x - p.pixel[0]) * (x - p.pixel[0]) + py) * low_pass;
-        // NaN and infinities of a ray along the plane fall to the low-pass.
-        let plane_wins = (on_plane <= on_screen) & (z > settings.near_m);
-        let rho = if plane_wins { on_plane } else { on_screen };
-        let depth = if plane_wins { z } else { p.z };
-        let alpha = (p.opacity * exp_neg(0.5 * rho.min(160.0))).min(ALPHA_MAX);
-        out.alpha[lane] = if alpha >= settings.alpha_min { alpha } else { 0.0 };
-        out.depth[lane] = depth;
-    }
-    out
-}
-
-/// The camera in single precision.
-#[derive(Clone, Copy)]
-pub(crate) struct CameraF32 {
-    pub inv_fx: f32,
-    pub inv_fy: f32,
-    pub cx: f32,
-    pub cy: f32,
-}
-
-impl From<&Intrinsics> for CameraF32 {
-    fn from(c: &Intrinsics) -> Self {
-        CameraF32 { inv_fx: (1.0 / c.fx) as f32, inv_fy: (1.0 / c.fy) as f32, cx: c.cx as f32, cy: c.cy as f32 }
-    }
-}
-
-/// Blends a tile whose first pixel is `origin`.
-#[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(crate) fn blend_tile(
-    projected: &[Projected],
-    list: &[u32],
-    origin: [f32; 2],
-    camera: &Intrinsics,
-    settings: &RenderSettings,
-    observed: Option<&ObservedTile>,
-) -> TileImages {
-    let camera = CameraF32::from(camera);
-    let mut out = TileImages {
-        color: [[0.0; LANES]; 3],
-        depth: [0.0; LANES],
-        depth_squared: [0.0; LANES],
-        median: [0.0; LANES],
-        opacity: [0.0; LANES],
-        normal: [[0.0; LANES]; 3],
-        near: [0.0; LANES],
-        hits: 0,
-    };
-    let mut passing = [1.0f32; LANES];
-    for (count, surfel) in list.iter().enumerate() {
-        if count % 16 == 0 && passing.iter().all(|t| *t <= settings.transmittance_min) {
-            break;
+impl TileImages {
+    pub fn empty() -> Self {
+        let zero = [0.0; TILE * TILE];
+        TileImages {
+            color: [zero; 3],
+            depth: zero,
+            opacity: zero,
+            median: zero,
+            spread: zero,
+            normal: [zero; 3],
+            near: zero,
+            hits: 0,
         }
-        let p = &projected[*surfel as usize];
-        // The normal that faces the camera: its plane's offset is negative.
-        let facing = if p.k > 0.0 { -1.0 } else { 1.0 };
-        for row in rows(p, origin[1]) {
-            let hits = row_hits(p, origin[0], origin[1] + row as f32, &camera, settings);
-            let base = row * TILE;
-            let mut counted = 0u32;
-            for lane in 0..TILE {
-                let i = base + lane;
-                let t = passing[i];
-                let alpha = if t > settings.transmittance_min { hits.alpha[lane] } else { 0.0 };
-                let depth = hits.depth[lane];
-                let weight = alpha * t;
-                let after = t * (1.0 - alpha);
-                counted += (alpha > 0.0) as u32;
+    }
+}
+
+/// A tile's surfels from near to far.
+#[derive(Default)]
+pub(crate) struct TileSurfels {
+    /// On return from the blend: the blocks in which something was blended.
+    pub entries: Vec<Entry>,
+    /// As the entries.
+    pub projected: Vec<Projected>,
+    /// Which of them touch a block.
+    blocks: [Vec<u32>; BLOCKS],
+}
+
+impl TileSurfels {
+    /// Takes a tile's entries; `slots` is by rank, `projected` by slot.
+    pub fn gather(&mut self, entries: impl Iterator<Item = Entry>, slots: &[u32], projected: &[Projected]) {
+        self.entries.clear();
+        self.entries.extend(entries);
+        self.fetch(slots, projected);
+        self.blocks.iter_mut().for_each(Vec::clear);
+        for (index, entry) in self.entries.iter_mut().enumerate() {
+            let mut left = std::mem::take(&mut entry.blocks);
+            while left != 0 {
+                self.blocks[left.trailing_zeros() as usize % BLOCKS].push(index as u32);
+                left &= left - 1;
+            }
+        }
+    }
+
+    /// Takes what the blend left.
+    pub fn gather_blended(&mut self, entries: &[Entry], slots: &[u32], projected: &[Projected]) {
+        self.entries.clear();
+        self.entries.extend_from_slice(entries);
+        self.fetch(slots, projected);
+    }
+
+    /// A loop of its own: its cache misses overlap, as they would not between the blend's computations.
+    fn fetch(&mut self, slots: &[u32], projected: &[Projected]) {
+        self.projected.clear();
+        self.projected
+            .extend(self.entries.iter().map(|entry| projected[slots[entry.rank as usize] as usize]));
+    }
+}
+
+/// Blends a tile. `DETAIL`: median and spread of depth. `NORMAL`: normals. `GROWTH`: looks for surfels near the
+/// observed depth, in front or hidden.
+pub(crate) struct Blend<'a, const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> {
+    pub surfels: &'a mut TileSurfels,
+    /// The tile's first pixel.
+    pub origin: [f32; 2],
+    pub camera: &'a Intrinsics,
+    pub settings: &'a RenderSettings,
+    /// Only looked at for `GROWTH`.
+    pub observed: &'a ObservedTile,
+    pub out: &'a mut TileImages,
+}
+
+/// After so many surfels a block looks whether its pixels are done.
+const PATIENCE: usize = 4;
+
+impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
+    for Blend<'_, DETAIL, NORMAL, GROWTH>
+{
+    type Output = ();
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, simd: S) {
+        let constants = Constants::new(simd, self.camera, self.settings);
+        let number = |value: f32| Lanes::splat(simd, value);
+        let (zero, one, half) = (number(0.0), number(1.0), number(0.5));
+        let TileSurfels { entries, projected, blocks } = self.surfels;
+        let out = self.out;
+        let tile = TilePixels::of(simd, &constants, self.origin);
+        let mut hits = 0.0f64;
+        for (block, list) in blocks.iter().enumerate() {
+            for part in 0..LANES / S::F32_LANES {
+                let at = block * (LANES / S::F32_LANES) + part;
+                let pixels = tile.load(simd, at);
+                let mut passing = pixels.inside(&constants).select(one, zero);
+                let (mut color, mut normal) = ([zero; 3], [zero; 3]);
+                let (mut depth, mut depth_squared, mut median) = (zero, zero, zero);
+                let (mut near, mut counted) = (zero, zero);
+                let observed = Lanes::load(simd, &self.observed.depth, at);
+                let tolerance = Lanes::load(simd, &self.observed.tolerance, at);
+                for (step, index) in list.iter().enumerate() {
+                    if step % PATIENCE == 0 {
+                        let mut open = constants.transmittance_min.less(passing);
+                        if GROWTH {
+                            // An observed pixel looks on for a surfel near it.
+                            open = open.or(near.less(half).and(zero.less(tolerance)));
+                        }
+                        if !open.any() {
+                            break;
+                        }
+                    }
+                    let p = &projected[*index as usize];
+                    let hit = Hits::of(simd, p, &pixels, &constants);
+                    let found = constants.alpha_min.at_most(hit.alpha);
+                    let live = found.and(constants.transmittance_min.less(passing));
+                    entries[*index as usize].blocks |= (live.any() as u16) << block;
+                    let weight = live.select(hit.alpha * passing, zero);
+                    let after = passing - weight;
+                    counted = counted + live.select(one, zero);
+                    for c in 0..3 {
+                        color[c] = weight.mul_add(number(p.color[c]), color[c]);
+                    }
+                    let weighted_depth = weight * hit.depth;
+                    depth = depth + weighted_depth;
+                    if DETAIL {
+                        depth_squared = weighted_depth.mul_add(hit.depth, depth_squared);
+                        median = half.less(passing).and(after.at_most(half)).select(hit.depth, median);
+                    }
+                    if NORMAL {
+                        // The normal that faces the camera: its plane's offset is negative.
+                        let facing = if p.k > 0.0 { -1.0 } else { 1.0 };
+                        for c in 0..3 {
+                            normal[c] = weight.mul_add(number(facing * p.n[c]), normal[c]);
+                        }
+                    }
+                    if GROWTH {
+                        let close = (hit.depth - observed).abs().at_most(tolerance);
+                        near = close.and(found).select(one, near);
+                    }
+                    passing = after;
+                }
+                hits += counted.sum() as f64;
+                let opacity = one - passing;
+                let covered = zero.less(opacity);
+                let share = covered.select(one / opacity, zero);
+                let expected = depth * share;
+                opacity.store(&mut out.opacity, at);
+                expected.store(&mut out.depth, at);
                 for c in 0..3 {
-                    out.color[c][i] += weight * p.color[c];
-                    out.normal[c][i] += weight * facing * p.n[c];
+                    color[c].store(&mut out.color[c], at);
                 }
-                out.depth[i] += weight * depth;
-                out.depth_squared[i] += weight * depth * depth;
-                out.median[i] = if (t > 0.5) & (after <= 0.5) { depth } else { out.median[i] };
-                passing[i] = after;
-            }
-            out.hits += counted as u64;
-            if let Some(observed) = observed {
-                for lane in 0..TILE {
-                    let i = base + lane;
-                    let close = (hits.depth[lane] - observed.depth[i]).abs() <= observed.tolerance[i];
-                    let seen = (hits.alpha[lane] > 0.0) & (passing[i] < 1.0);
-                    out.near[i] = if close & seen { 1.0 } else { out.near[i] };
+                if DETAIL {
+                    let variance = depth_squared * share - expected * expected;
+                    variance.max(zero).sqrt().store(&mut out.spread, at);
+                    median.store(&mut out.median, at);
+                }
+                if NORMAL {
+                    let squared =
+                        normal[0].mul_add(normal[0], normal[1].mul_add(normal[1], normal[2] * normal[2]));
+                    let length = squared.sqrt();
+                    let scale = number(1e-12).less(length).select(one / length, zero);
+                    for c in 0..3 {
+                        (normal[c] * scale).store(&mut out.normal[c], at);
+                    }
+                }
+                if GROWTH {
+                    near.store(&mut out.near, at);
                 }
             }
         }
+        out.hits = hits as u64;
     }
-    for i in 0..LANES {
-        out.opacity[i] = 1.0 - passing[i];
-    }
-    out
 }

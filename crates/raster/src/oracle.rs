@@ -68,7 +68,13 @@ pub fn render(surfels: &[OracleSurfel], camera: &Intrinsics, settings: &RenderSe
     out
 }
 
-fn pixel(order: &[&OracleSurfel], x: f64, y: f64, camera: &Intrinsics, settings: &RenderSettings) -> OraclePixel {
+fn pixel(
+    order: &[&OracleSurfel],
+    x: f64,
+    y: f64,
+    camera: &Intrinsics,
+    settings: &RenderSettings,
+) -> OraclePixel {
     let ray = camera.ray(x, y);
     let (mut passing, mut depth_sum) = (1.0f64, 0.0f64);
     let mut out = OraclePixel::default();

@@ -1,6 +1,7 @@
 //! Settings of the renderer.
 
-use crate::{LANES, TILE};
+use crate::TILE;
+use crate::blend::TileImage;
 use coma_frame::{DepthNoise, Image};
 use serde::{Deserialize, Serialize};
 
@@ -29,7 +30,8 @@ impl Default for RenderSettings {
     }
 }
 
-/// Eq. 5 in the blending pass: is a surfel of the blend near the observed depth?
+/// Eq. 5 in the blending pass: is there a surfel near the observed depth? One that is hidden counts too: what
+/// is known need not grow again.
 #[derive(Clone, Copy, Debug)]
 pub struct GrowthTest<'a> {
     /// Of the camera's size; 0 = no measurement (never near).
@@ -42,22 +44,47 @@ pub struct GrowthTest<'a> {
     pub relative: f32,
 }
 
-/// Observed depth and tolerance of one tile's pixels.
-pub(crate) struct ObservedTile {
-    pub depth: [f32; LANES],
-    pub tolerance: [f32; LANES],
+/// Which images a rendering holds besides colour, expected depth, opacity and the growth test; the others are
+/// left empty (0 x 0).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Outputs {
+    /// Median and spread of depth.
+    pub depth_detail: bool,
+    /// Normals.
+    pub normal: bool,
 }
 
-impl GrowthTest<'_> {
-    pub(crate) fn tile(&self, x0: usize, y0: usize) -> ObservedTile {
-        let mut out = ObservedTile { depth: [0.0; LANES], tolerance: [-1.0; LANES] };
-        for lane in 0..LANES {
-            let depth = self.observed_depth_m.get(x0 + lane % TILE, y0 + lane / TILE).copied().unwrap_or(0.0);
+impl Outputs {
+    /// Everything.
+    pub const ALL: Outputs = Outputs { depth_detail: true, normal: true };
+    /// What a frame is tracked against: depth that can be judged.
+    pub const TRACKING: Outputs = Outputs { depth_detail: true, normal: false };
+    /// What losses are made of, and all that [`crate::backward`] needs.
+    pub const OPTIMISING: Outputs = Outputs { depth_detail: false, normal: false };
+}
+
+/// Observed depth and tolerance of one tile's pixels.
+pub(crate) struct ObservedTile {
+    pub depth: TileImage,
+    /// Negative without a measurement.
+    pub tolerance: TileImage,
+}
+
+impl ObservedTile {
+    pub fn none() -> Self {
+        ObservedTile { depth: [0.0; TILE * TILE], tolerance: [-1.0; TILE * TILE] }
+    }
+
+    /// Reads the tile whose first pixel is `origin`.
+    pub fn read(&mut self, test: &GrowthTest<'_>, origin: [usize; 2]) {
+        *self = ObservedTile::none();
+        for (i, [x, y]) in crate::tile_pixels().enumerate() {
+            let depth = test.observed_depth_m.get(origin[0] + x, origin[1] + y).copied().unwrap_or(0.0);
             if depth > 0.0 {
-                out.depth[lane] = depth;
-                out.tolerance[lane] = (self.sigma_factor * self.noise.sigma_m(depth)).max(self.relative * depth);
+                self.depth[i] = depth;
+                self.tolerance[i] =
+                    (test.sigma_factor * test.noise.sigma_m(depth)).max(test.relative * depth);
             }
         }
-        out
     }
 }

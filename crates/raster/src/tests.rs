@@ -1,6 +1,6 @@
 use super::*;
 use coma_frame::DepthNoise;
-use coma_geometry::{Tangent, se3};
+use coma_geometry::{Intrinsics, Tangent, se3};
 use coma_surfel::Surfel;
 use nalgebra::{UnitQuaternion, Vector3};
 use oracle::OraclePixel;
@@ -131,7 +131,11 @@ fn pixel_gradients() -> PixelGradients {
 }
 
 /// Central differences of the oracle's loss under a change of the surfels in the camera's frame.
-fn difference(base: &[oracle::OracleSurfel], step: f64, change: impl Fn(&mut Vec<oracle::OracleSurfel>, f64)) -> f64 {
+fn difference(
+    base: &[oracle::OracleSurfel],
+    step: f64,
+    change: impl Fn(&mut Vec<oracle::OracleSurfel>, f64),
+) -> f64 {
     let at = |s: f64| {
         let mut moved = base.to_vec();
         change(&mut moved, s);
@@ -254,7 +258,13 @@ fn the_same_bits_come_from_one_thread_and_from_two() {
 #[test]
 fn growth_sees_a_surfel_only_near_the_observed_depth() {
     let q = [1.0, 0.0, 0.0, 0.0];
-    let wall = Surfel { center_m: [0.0, 0.0, 2.0], rotation_wxyz: q, scale_m: [0.5; 2], opacity: 0.9, color: [0.5; 3] };
+    let wall = Surfel {
+        center_m: [0.0, 0.0, 2.0],
+        rotation_wxyz: q,
+        scale_m: [0.5; 2],
+        opacity: 0.9,
+        color: [0.5; 3],
+    };
     let cloud: SurfelCloud = [wall].into_iter().collect();
     let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
     let near = |observed: f32| {
@@ -272,7 +282,13 @@ fn growth_sees_a_surfel_only_near_the_observed_depth() {
 fn depth_along_a_tilted_surfel_is_that_of_the_ray_s_hit() {
     let tilt = UnitQuaternion::from_scaled_axis(Vector3::new(0.0, 0.6, 0.0));
     let q = [tilt.w, tilt.i, tilt.j, tilt.k];
-    let disc = Surfel { center_m: [0.0, 0.0, 2.0], rotation_wxyz: q, scale_m: [0.6; 2], opacity: 0.99, color: [1.0; 3] };
+    let disc = Surfel {
+        center_m: [0.0, 0.0, 2.0],
+        rotation_wxyz: q,
+        scale_m: [0.6; 2],
+        opacity: 0.99,
+        color: [1.0; 3],
+    };
     let cloud: SurfelCloud = [disc].into_iter().collect();
     let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
     let rendering = render(&views, &CAMERA, &RenderSettings::default(), None);

@@ -51,10 +51,20 @@ pub fn align(source: &View, target: &View, settings: &Settings, seed: u64) -> Ou
 
 /// [`align`] for views that are prepared already, with the same settings.
 pub fn align_prepared(source: &Prepared, target: &Prepared, settings: &Settings, seed: u64) -> Outcome {
-    let mut hypotheses = match coarse(source, target, settings, seed) {
-        Ok(hypotheses) => hypotheses,
-        Err(reason) => return Outcome::Rejected(reason),
-    };
+    match coarse(source, target, settings, seed) {
+        Ok(hypotheses) => decide(source, target, hypotheses, settings),
+        Err(reason) => Outcome::Rejected(reason),
+    }
+}
+
+/// The second half of [`align_prepared`]: the best of [`coarse`]'s hypotheses are refined and verified, and the
+/// one that both views agree with most is the verdict.
+pub fn decide(
+    source: &Prepared,
+    target: &Prepared,
+    mut hypotheses: Vec<Hypothesis>,
+    settings: &Settings,
+) -> Outcome {
     // The best few get a coarse ICP and are ranked again.
     hypotheses.truncate(settings.refined_hypotheses.max(1));
     let (source_coarse, target_coarse) = searchable(source, target, 0, 1500);

@@ -12,7 +12,7 @@
 //! 8. [`verify`]: overlap, free-space conflicts and photometric agreement at the found pose.
 //!
 //! [`align`] runs them all and ends as [`Outcome::Accepted`] or [`Outcome::Rejected`] with its reason.
-//! [`coarse`], [`refine`] and [`verify::verify`] are the parts.
+//! [`coarse`], [`decide`], [`refine`] and [`verify::verify`] are the parts.
 //!
 //! Poses are `target_from_source`. Tangents and information matrices are in the order of
 //! `coma_geometry` (translation, rotation), perturbed on the right: `target_from_source * exp(xi)`.
@@ -31,7 +31,7 @@ pub mod settings;
 pub mod verify;
 pub mod view;
 
-pub use align::{Hypothesis, align, align_prepared, coarse, refine};
+pub use align::{Hypothesis, align, align_prepared, coarse, decide, refine};
 pub use cloud::PointCloud;
 pub use outcome::{Alignment, Outcome, Reason, Side};
 pub use settings::Settings;

@@ -4,19 +4,21 @@ use coma_runtime::membership::Myself;
 use coma_runtime::{ByteLedger, Class, Member, Membership, MembershipSettings};
 use std::time::Duration;
 
-async fn start(agent: &str, generation: u64, seeds: &[String], cluster: &str, ledger: &ByteLedger) -> Membership {
+async fn start(
+    agent: &str,
+    generation: u64,
+    seeds: &[String],
+    cluster: &str,
+    ledger: &ByteLedger,
+) -> Membership {
     let settings = MembershipSettings {
         cluster_id: cluster.into(),
         seeds: seeds.to_vec(),
         interval_s: 0.05,
         ..Default::default()
     };
-    let myself = Myself {
-        agent_id: agent.into(),
-        epoch: 7,
-        generation,
-        endpoint: format!("http://{agent}:7000"),
-    };
+    let myself =
+        Myself { agent_id: agent.into(), epoch: 7, generation, endpoint: format!("http://{agent}:7000") };
     Membership::start(&settings, &myself, ledger).await.unwrap()
 }
 
@@ -64,6 +66,7 @@ async fn three_agents_find_each_other_and_miss_the_one_that_dies() {
 async fn an_address_that_nobody_can_send_to_is_refused() {
     let settings = MembershipSettings { listen: "0.0.0.0:0".parse().unwrap(), ..Default::default() };
     let myself = Myself { agent_id: "a".into(), epoch: 1, generation: 1, endpoint: "http://a:1".into() };
-    let error = Membership::start(&settings, &myself, &ByteLedger::default()).await.err().unwrap().to_string();
+    let error =
+        Membership::start(&settings, &myself, &ByteLedger::default()).await.err().unwrap().to_string();
     assert!(error.contains("membership.advertise"), "{error}");
 }

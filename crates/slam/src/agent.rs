@@ -261,7 +261,12 @@ impl Agent {
     }
 
     /// A first submap, or the first after the camera was lost: its chain is tied to nothing yet.
-    fn start_chain(&mut self, frame: Arc<RgbdFrame>, view: TrackingView, options: FrameOptions) -> FrameOutcome {
+    fn start_chain(
+        &mut self,
+        frame: Arc<RgbdFrame>,
+        view: TrackingView,
+        options: FrameOptions,
+    ) -> FrameOutcome {
         let tracked = Tracked {
             agent_from_camera: self.last_pose,
             brightness: self.brightness,
@@ -365,7 +370,12 @@ impl Agent {
         vec![opened, Event::Odometry(OdometryEdge { from, to, from_from_to, information })]
     }
 
-    fn open_submap(&mut self, frame: &Arc<RgbdFrame>, chain: u32, agent_from_submap: Pose) -> (SubmapId, Event) {
+    fn open_submap(
+        &mut self,
+        frame: &Arc<RgbdFrame>,
+        chain: u32,
+        agent_from_submap: Pose,
+    ) -> (SubmapId, Event) {
         let id = SubmapId { agent: self.id.clone(), epoch: self.epoch, number: self.next_submap };
         self.next_submap += 1;
         self.active = Some(ActiveSubmap::open(id.clone(), chain, agent_from_submap));

@@ -120,7 +120,11 @@ impl Replica {
 
     /// The length of every log.
     pub fn heads(&self) -> VersionVector {
-        self.logs.iter().filter(|(_, log)| !log.entries.is_empty()).map(|(k, log)| (k.clone(), log.entries.len() as u64)).collect()
+        self.logs
+            .iter()
+            .filter(|(_, log)| !log.entries.is_empty())
+            .map(|(k, log)| (k.clone(), log.entries.len() as u64))
+            .collect()
     }
 
     /// The hash that the next entry of a log must name.
@@ -129,7 +133,11 @@ impl Replica {
     }
 
     /// What the holder of `have` lacks, log by log, each in order, at most `limit` entries.
-    pub fn missing<'a>(&'a self, have: &'a VersionVector, limit: usize) -> impl Iterator<Item = &'a Entry> + 'a {
+    pub fn missing<'a>(
+        &'a self,
+        have: &'a VersionVector,
+        limit: usize,
+    ) -> impl Iterator<Item = &'a Entry> + 'a {
         self.logs
             .iter()
             .flat_map(move |(key, log)| {

@@ -34,6 +34,7 @@ fn two_agents_without_names_get_two_names() {
 fn an_agent_that_lost_its_disk_has_a_later_epoch() {
     let (before, after) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let first = Identity::open(before.path(), id("alice")).unwrap();
+    #[allow(clippy::disallowed_methods, reason = "an epoch is the time of its start, to the millisecond")]
     std::thread::sleep(std::time::Duration::from_millis(2));
     let second = Identity::open(after.path(), id("alice")).unwrap();
     assert!(second.epoch() > first.epoch());

@@ -1,8 +1,9 @@
-//! Submaps as one cloud in the map. What a submap before already shows is dropped.
+//! Submaps as one cloud in the map. Where several show the same surface, the one that shows it in most detail stays.
 //!
-//! The rule: space is cut into cubes, and each cube into six by the direction that normals face. Where the
-//! discs of submaps before cover a cube's face, surfels of later ones are dropped; a submap never drops its
-//! own. Walls seen from both sides keep both sides.
+//! The rule: space is cut into cubes, and each cube into six by the direction that normals face. Among the submaps
+//! whose discs cover a cube's face, the first of those with about the finest discs keeps its surfels there; the others'
+//! are dropped. Cubes before and behind the surface count too, as errors of depth cross their borders. Walls seen from
+//! both sides keep both sides.
 
 use crate::{Surfel, SurfelCloud};
 use coma_geometry::Pose;
@@ -22,42 +23,97 @@ pub struct Part<'a> {
 pub struct MergeSettings {
     /// Side of a cube, metres. Default: 0.02, a little over the error of a good loop.
     pub cell_m: f64,
-    /// A cube is shown when the discs of submaps before (to one standard deviation, times opacity) have so
-    /// many times the area of its face. Default: 0.5.
+    /// A submap shows a cube when its discs (to one standard deviation, times opacity) have so many times the area of
+    /// the cube's face. Default: 0.5.
     pub coverage: f32,
+    /// Discs are about the finest when they have at most so many times the area of the finest. Default: 1.5.
+    pub detail: f32,
 }
 
 impl Default for MergeSettings {
     fn default() -> Self {
-        MergeSettings { cell_m: 0.02, coverage: 0.5 }
+        MergeSettings { cell_m: 0.02, coverage: 0.5, detail: 1.5 }
     }
 }
 
 /// A cube, and which of the six directions a normal faces most.
 type Cell = ([i32; 3], u8);
 
+/// What one submap has in a cube.
+#[derive(Clone, Copy)]
+struct Share {
+    part: usize,
+    /// Of its discs, times opacity, each at most the cube's face.
+    shown_m2: f32,
+    /// Of its discs.
+    discs_m2: f32,
+    count: u32,
+}
+
 /// One cloud in the map, submap by submap in the order given. Surfels that are not finite are left out.
 pub fn merge(parts: &[Part<'_>], settings: &MergeSettings) -> SurfelCloud {
     let face_m2 = (settings.cell_m * settings.cell_m) as f32;
-    let mut shown_m2: HashMap<Cell, f32> = HashMap::new();
-    let mut out = SurfelCloud::default();
-    for part in parts {
-        let mut own_m2: HashMap<Cell, f32> = HashMap::new();
-        for surfel in part.surfels.iter().filter(Surfel::is_finite) {
-            let in_map = surfel.moved(&part.map_from_submap);
-            let cell = cell(&in_map, settings.cell_m);
-            if shown_m2.get(&cell).is_some_and(|m2| *m2 >= settings.coverage * face_m2) {
-                continue;
-            }
-            let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1] * surfel.opacity;
-            *own_m2.entry(cell).or_default() += disc_m2.min(face_m2);
-            out.push(in_map);
+    let mut shares: HashMap<Cell, Vec<Share>> = HashMap::new();
+    for (part, surfel) in placed(parts) {
+        let of_cell = shares.entry(cell(&surfel, settings.cell_m)).or_default();
+        if of_cell.last().is_none_or(|s| s.part != part) {
+            of_cell.push(Share { part, shown_m2: 0.0, discs_m2: 0.0, count: 0 });
         }
-        for (cell, m2) in own_m2 {
-            *shown_m2.entry(cell).or_default() += m2;
+        let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1];
+        if let Some(share) = of_cell.last_mut() {
+            share.shown_m2 += (disc_m2 * surfel.opacity).min(face_m2);
+            share.discs_m2 += disc_m2;
+            share.count += 1;
+        }
+    }
+    let mut keepers: HashMap<Cell, Option<usize>> = HashMap::new();
+    let mut out = SurfelCloud::default();
+    for (part, surfel) in placed(parts) {
+        let cell = cell(&surfel, settings.cell_m);
+        let keeper = *keepers.entry(cell).or_insert_with(|| keeper(&shares, cell, face_m2, settings));
+        if keeper.is_none_or(|keeper| keeper == part) {
+            out.push(surfel);
         }
     }
     out
+}
+
+fn placed<'a>(parts: &'a [Part<'_>]) -> impl Iterator<Item = (usize, Surfel)> + 'a {
+    let finite = |part: &'a Part<'_>| part.surfels.iter().filter(Surfel::is_finite);
+    parts
+        .iter()
+        .enumerate()
+        .flat_map(move |(i, part)| finite(part).map(move |s| (i, s.moved(&part.map_from_submap))))
+}
+
+/// Which submap keeps its surfels in a cube; `None` if none shows it.
+fn keeper(
+    shares: &HashMap<Cell, Vec<Share>>,
+    cell: Cell,
+    face_m2: f32,
+    settings: &MergeSettings,
+) -> Option<usize> {
+    let (cube, side) = cell;
+    let axis = side as usize / 2;
+    let mut sums: Vec<Share> = Vec::new();
+    for step in [0, -1, 1] {
+        let mut near = cube;
+        near[axis] = near[axis].saturating_add(step);
+        for share in shares.get(&(near, side)).into_iter().flatten() {
+            match sums.iter_mut().find(|s| s.part == share.part) {
+                Some(sum) => {
+                    sum.shown_m2 += share.shown_m2;
+                    sum.discs_m2 += share.discs_m2;
+                    sum.count += share.count;
+                }
+                None => sums.push(*share),
+            }
+        }
+    }
+    sums.retain(|s| s.shown_m2 >= settings.coverage * face_m2);
+    let disc_m2 = |s: &Share| s.discs_m2 / s.count.max(1) as f32;
+    let finest_m2 = sums.iter().map(disc_m2).fold(f32::INFINITY, f32::min);
+    sums.iter().filter(|s| disc_m2(s) <= settings.detail * finest_m2).map(|s| s.part).min()
 }
 
 fn cell(surfel: &Surfel, cell_m: f64) -> Cell {
@@ -90,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_submap_before_shows_is_dropped_and_what_is_new_is_kept() {
+    fn what_a_submap_before_shows_as_well_is_dropped_and_what_is_new_is_kept() {
         let wall = wall(false);
         let merged = merge(&[at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)], &MergeSettings::default());
         // The second wall adds its right half.
@@ -115,7 +171,28 @@ mod tests {
         faint.opacity.fill(0.05);
         let solid = wall(false);
         let merged = merge(&[at(&faint, 0.0, 0.005), at(&solid, 0.0, 0.005)], &MergeSettings::default());
-        assert_eq!(merged.len(), 2 * solid.len());
+        assert_eq!(merged, merge(&[at(&solid, 0.0, 0.005)], &MergeSettings::default()));
+    }
+
+    #[test]
+    fn finer_surfels_replace_coarser_ones_whatever_the_order() {
+        let fine = wall(false);
+        let mut coarse = wall(false);
+        coarse.scale_m.fill([0.02, 0.02]);
+        for parts in
+            [[at(&fine, 0.0, 0.005), at(&coarse, 0.0, 0.01)], [at(&coarse, 0.0, 0.01), at(&fine, 0.0, 0.005)]]
+        {
+            let merged = merge(&parts, &MergeSettings::default());
+            assert_eq!(merged.len(), fine.len());
+            assert!(merged.scale_m.iter().all(|s| s[0] == 0.01));
+        }
+    }
+
+    #[test]
+    fn a_surface_on_the_border_of_two_cubes_is_one_surface() {
+        let wall = wall(false);
+        let merged = merge(&[at(&wall, 0.0, 0.0195), at(&wall, 0.0, 0.0205)], &MergeSettings::default());
+        assert_eq!(merged.len(), wall.len());
     }
 
     #[test]

@@ -147,7 +147,7 @@ impl Wire for Calibration {
             ));
         }
         let units = m.depth_units_per_metre;
-        if !(units >= 1.0 && units <= 1e6) {
+        if !(1.0..=1e6).contains(&units) {
             return Err(at.field("depth_units_per_metre").refuse(format!("{units} is not within 1 and 1e6")));
         }
         let min = finite(m.depth_min_m, &at.field("depth_min_m"))?;

@@ -52,13 +52,15 @@ fn decode_depth(data: &DepthData, calibration: &Calibration) -> Result<Image<f32
     let refuse = |message: String| FieldError::new("frame.depth", message);
     let metres = |raw: u16| raw as f32 / calibration.depth_units_per_metre as f32;
     let depth = match data {
-        DepthData::Raw16(bytes) => bytes.chunks_exact(2).map(|b| metres(u16::from_le_bytes([b[0], b[1]]))).collect(),
+        DepthData::Raw16(bytes) => {
+            bytes.chunks_exact(2).map(|b| metres(u16::from_le_bytes([b[0], b[1]]))).collect()
+        }
         DepthData::Png16(bytes) => match picture(bytes, ImageFormat::Png, width, height, "frame.depth")? {
             DynamicImage::ImageLuma16(image) => image.into_raw().into_iter().map(metres).collect(),
             other => return Err(refuse(format!("is a {:?} PNG, 16-bit grey is needed", other.color()))),
         },
         DepthData::Coma(bytes) => {
-            let limits = coma_depth_codec::Limits { max_pixels: camera.pixels(), ..Default::default() };
+            let limits = coma_depth_codec::Limits { max_pixels: camera.pixels() };
             let decoded = coma_depth_codec::decode(bytes, limits).map_err(|e| refuse(e.to_string()))?;
             if decoded.depth_m.width() != width as usize || decoded.depth_m.height() != height as usize {
                 let (w, h) = (decoded.depth_m.width(), decoded.depth_m.height());
@@ -67,7 +69,8 @@ fn decode_depth(data: &DepthData, calibration: &Calibration) -> Result<Image<f32
             decoded.depth_m.into_pixels()
         }
     };
-    let (min, max) = (calibration.depth_min_m as f32, calibration.depth_max_m.map_or(f32::INFINITY, |m| m as f32));
+    let (min, max) =
+        (calibration.depth_min_m as f32, calibration.depth_max_m.map_or(f32::INFINITY, |m| m as f32));
     let depth = depth.into_iter().map(|z: f32| if z >= min && z <= max { z } else { 0.0 }).collect();
     Image::from_pixels(width as usize, height as usize, depth)
         .ok_or_else(|| refuse(format!("is not {width}x{height} pixels")))

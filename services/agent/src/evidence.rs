@@ -23,11 +23,8 @@ pub struct AnchorEvidence {
 
 /// Compresses an anchor: depth in steps that follow the sensor's noise, intensity as a small JPEG.
 pub fn from_frame(frame: &RgbdFrame) -> anyhow::Result<AnchorEvidence> {
-    let mut level = Level {
-        camera: frame.camera,
-        depth_m: frame.depth_m.clone(),
-        intensity: frame.color.luminance(),
-    };
+    let mut level =
+        Level { camera: frame.camera, depth_m: frame.depth_m.clone(), intensity: frame.color.luminance() };
     while level.camera.width > FULL_WIDTH {
         level = level.halved();
     }
@@ -75,14 +72,20 @@ impl Level {
 pub fn to_view(name: &Evidence, blob: Bytes) -> Result<View, FieldError> {
     let blob = decode_evidence(name, blob)?;
     let camera = blob.camera;
-    let limits = coma_depth_codec::Limits { max_pixels: camera.pixels(), ..Default::default() };
+    let limits = coma_depth_codec::Limits { max_pixels: camera.pixels() };
     let decoded = coma_depth_codec::decode(&blob.depth, limits)
         .map_err(|e| FieldError::new("blob.depth", e.to_string()))?;
-    if decoded.depth_m.width() != camera.width as usize || decoded.depth_m.height() != camera.height as usize {
+    if decoded.depth_m.width() != camera.width as usize || decoded.depth_m.height() != camera.height as usize
+    {
         return Err(FieldError::new("blob.depth", "has another size than its camera"));
     }
-    let picture =
-        crate::decode::picture(&blob.intensity, ImageFormat::Jpeg, camera.width, camera.height, "blob.intensity")?;
+    let picture = crate::decode::picture(
+        &blob.intensity,
+        ImageFormat::Jpeg,
+        camera.width,
+        camera.height,
+        "blob.intensity",
+    )?;
     let grey = picture.into_luma8().into_raw().into_iter().map(|v| v as f32 / 255.0).collect();
     let intensity = Image::from_pixels(camera.width as usize, camera.height as usize, grey)
         .ok_or_else(|| FieldError::new("blob.intensity", "has another size than its camera"))?;

@@ -84,7 +84,9 @@ impl Journal {
         let mut restored = Restored { entries: Vec::new(), checkpoints: Vec::new(), notes };
         for record in entries.iter() {
             let bytes = record?.bytes;
-            restored.entries.push(coma_wire::entry_from_bytes(&bytes).context("an entry of the log on disk")?);
+            restored
+                .entries
+                .push(coma_wire::entry_from_bytes(&bytes).context("an entry of the log on disk")?);
         }
         for record in checkpoints.iter() {
             let kept: KeptCheckpoint =

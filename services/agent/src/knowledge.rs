@@ -180,7 +180,9 @@ impl Knowledge {
                 }
             },
             Offered::Known => {}
-            Offered::Gap { have } => warn!(agent = %key.agent, sequence = key.sequence, have, "an entry came before its time"),
+            Offered::Gap { have } => {
+                warn!(agent = %key.agent, sequence = key.sequence, have, "an entry came before its time")
+            }
             Offered::Conflict { key } => {
                 let text = format!(
                     "two different entries under {}/{}/{}: neither is used, nor what follows",
@@ -209,7 +211,12 @@ impl Knowledge {
         let own = |c: &&coma_slam::loop_closure::corrections::Correction| {
             c.map_from_submap.keys().any(|id| id.agent == self.agent && id.epoch == self.epoch)
         };
-        self.corrections.components().iter().filter(own).max_by_key(|c| c.map_from_submap.len()).map(|c| &c.generation)
+        self.corrections
+            .components()
+            .iter()
+            .filter(own)
+            .max_by_key(|c| c.map_from_submap.len())
+            .map(|c| &c.generation)
     }
 
     /// Where a submap lies in the map.

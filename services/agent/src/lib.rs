@@ -71,7 +71,8 @@ impl Server {
     /// Opens the data folder, takes the port and starts to serve.
     pub async fn start(config: AgentConfig) -> anyhow::Result<Handle> {
         let needed = "set its endpoint, or use `coma agent`, which runs one beside the agent";
-        let place_recognition = config.place_recognition.clone().with_context(|| format!("place_recognition: {needed}"))?;
+        let place_recognition =
+            config.place_recognition.clone().with_context(|| format!("place_recognition: {needed}"))?;
         let dpgo = config.dpgo.clone().with_context(|| format!("dpgo: {needed}"))?;
         let identity = Identity::open(&config.data, config.agent_id.clone())?;
         let (agent_id, epoch) = (identity.agent_id().clone(), identity.epoch());
@@ -200,7 +201,12 @@ async fn find_peers(
     loop {
         if let Some(members) = &mut members {
             let alive = |m: &&coma_runtime::Member| m.alive && m.agent_id != agent_id;
-            members.borrow_and_update().iter().filter(alive).map(|m| m.endpoint.clone()).for_each(&mut follow);
+            members
+                .borrow_and_update()
+                .iter()
+                .filter(alive)
+                .map(|m| m.endpoint.clone())
+                .for_each(&mut follow);
         }
         let changed = async {
             match &mut members {

@@ -43,20 +43,21 @@ pub struct Node {
     session: Mutex<Option<Session>>,
     acks: broadcast::Sender<v1::FrameAck>,
     events: broadcast::Sender<v1::watch_response::Event>,
-    anchors: mpsc::UnboundedSender<AnchorJob>,
+    anchors: mpsc::Sender<AnchorJob>,
     found: mpsc::Sender<String>,
     begin: Instant,
 }
 
 /// What a node hands to its tasks.
 pub struct Inbox {
-    /// Anchors on their way to place recognition. They need no bound of their own: there is one per submap, and
-    /// the frame queue bounds those.
-    pub anchors: mpsc::UnboundedReceiver<AnchorJob>,
+    /// Anchors on their way to place recognition.
+    pub anchors: mpsc::Receiver<AnchorJob>,
     /// Endpoints of agents that called.
     pub found: mpsc::Receiver<String>,
 }
 
+/// Anchors that wait to be described; then mapping waits too, as each holds a whole frame.
+const ANCHORS: usize = 64;
 /// Callers' endpoints that wait to be followed; more are forgotten, as they call again.
 const FOUND: usize = 64;
 
@@ -68,7 +69,7 @@ impl Node {
         ledger: ByteLedger,
         knowledge: Knowledge,
     ) -> (Arc<Self>, Inbox) {
-        let (anchors, described) = mpsc::unbounded_channel();
+        let (anchors, described) = mpsc::channel(ANCHORS);
         let (found, followed) = mpsc::channel(FOUND);
         let node = Node {
             queue: FrameQueue::new(config.queue_frames),
@@ -126,10 +127,10 @@ impl Node {
         self.acks.subscribe()
     }
 
-    /// Hands an anchor to place recognition.
+    /// Hands an anchor to place recognition. For the mapping thread: it waits while too many are under way.
     pub fn describe(&self, submap: SubmapId, frame: Arc<RgbdFrame>) {
         self.unfinished.fetch_add(1, Ordering::SeqCst);
-        if self.anchors.send(AnchorJob { submap, frame }).is_err() {
+        if self.anchors.blocking_send(AnchorJob { submap, frame }).is_err() {
             self.unfinished.fetch_sub(1, Ordering::SeqCst);
         }
     }

@@ -55,11 +55,13 @@ impl Session {
     pub fn admit(&mut self, sequence: u64, stamp: StampNs) -> Result<(), FieldError> {
         if let Some((last, last_stamp)) = self.received {
             if sequence <= last {
-                let message = format!("{sequence} was received already: {last} was the last, sequences increase");
+                let message =
+                    format!("{sequence} was received already: {last} was the last, sequences increase");
                 return Err(FieldError::new("frame.sequence", message));
             }
             if stamp <= last_stamp {
-                let message = format!("{} ns does not lie after the frame before, {} ns", stamp.0, last_stamp.0);
+                let message =
+                    format!("{} ns does not lie after the frame before, {} ns", stamp.0, last_stamp.0);
                 return Err(FieldError::new("frame.stamp_ns", message));
             }
         }
@@ -70,7 +72,9 @@ impl Session {
 
     /// True for frames that may be mapped; the first always is.
     pub fn maps_this_frame(&self) -> bool {
-        self.hold_out_every == 0 || !(self.frames - 1).is_multiple_of(self.hold_out_every as u64) || self.frames == 1
+        self.hold_out_every == 0
+            || !(self.frames - 1).is_multiple_of(self.hold_out_every as u64)
+            || self.frames == 1
     }
 
     /// Adapts a live camera's work budget to the clock: less when frames had to be dropped, more when not.

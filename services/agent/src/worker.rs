@@ -105,9 +105,7 @@ impl Worker {
             }
         }
         if let Some(pose) = &outcome.pose {
-            knowledge
-                .trajectory
-                .push(TrajectoryPose { pose: pose.clone(), state: outcome.state.clone() });
+            knowledge.trajectory.push(TrajectoryPose { pose: pose.clone(), state: outcome.state.clone() });
         }
         let estimate = knowledge.trajectory.last().filter(|_| outcome.pose.is_some()).cloned();
         let message = estimate.map(|e| crate::convert::pose_estimate(&knowledge, &e));

@@ -127,44 +127,56 @@ fn report(graph: &crate::facts::Graph, solution: &coma_pose_graph::Solution, sec
     }
 }
 
+#[derive(Default)]
+struct Shelf {
+    /// By name: when a graph was last used, and the graph.
+    graphs: BTreeMap<String, (u64, Arc<Graph>)>,
+    /// Counts uses.
+    clock: u64,
+}
+
 /// The graphs of all callers, by name; the least recently used one makes room for a new one.
 pub struct Graphs {
     max_graphs: usize,
-    kept: Mutex<(BTreeMap<String, (u64, Arc<Graph>)>, u64)>,
+    shelf: Mutex<Shelf>,
 }
 
 impl Graphs {
     /// None yet.
     pub fn new(max_graphs: usize) -> Self {
-        Graphs { max_graphs, kept: Mutex::default() }
+        Graphs { max_graphs, shelf: Mutex::default() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Shelf> {
+        self.shelf.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// A graph that is here.
     pub fn get(&self, name: &str) -> Option<Arc<Graph>> {
-        let mut guard = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let (kept, clock) = &mut *guard;
+        let Shelf { graphs, clock } = &mut *self.lock();
         *clock += 1;
-        let (last_used, graph) = kept.get_mut(name)?;
+        let (last_used, graph) = graphs.get_mut(name)?;
         *last_used = *clock;
         Some(graph.clone())
     }
 
     /// A graph, made where it is not here.
     pub fn get_or_make(&self, name: &str) -> Arc<Graph> {
-        if let Some(found) = self.get(name) {
-            return found;
+        let Shelf { graphs, clock } = &mut *self.lock();
+        *clock += 1;
+        if let Some((last_used, graph)) = graphs.get_mut(name) {
+            *last_used = *clock;
+            return graph.clone();
         }
-        let mut guard = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let (kept, clock) = &mut *guard;
-        if kept.len() >= self.max_graphs
-            && !kept.contains_key(name)
-            && let Some(oldest) = kept.iter().min_by_key(|(_, (used, _))| *used).map(|(name, _)| name.clone())
+        if graphs.len() >= self.max_graphs
+            && let Some(oldest) =
+                graphs.iter().min_by_key(|(_, (used, _))| *used).map(|(name, _)| name.clone())
         {
             warn!(dropped = oldest, max_graphs = self.max_graphs, "the least recently used graph made room");
-            kept.remove(&oldest);
+            graphs.remove(&oldest);
         }
-        *clock += 1;
-        let made = || (*clock, Arc::default());
-        kept.entry(name.to_owned()).or_insert_with(made).1.clone()
+        let graph = Arc::<Graph>::default();
+        graphs.insert(name.to_owned(), (*clock, graph.clone()));
+        graph
     }
 }

@@ -3,7 +3,7 @@
 use coma_geometry::{AgentId, SubmapId};
 use coma_place::{Candidate, Candidates, Descriptor, Settings, Space, Thresholds};
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Mutex, PoisonError, RwLock};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use tracing::warn;
 
 /// An anchor as it came.
@@ -81,9 +81,12 @@ impl PlaceIndex {
     }
 }
 
-struct Kept {
-    index: Arc<RwLock<PlaceIndex>>,
-    last_used: u64,
+#[derive(Default)]
+struct Shelf {
+    /// By name: when an index was last used, and the index.
+    indices: BTreeMap<String, (u64, Arc<RwLock<PlaceIndex>>)>,
+    /// Counts uses.
+    clock: u64,
 }
 
 /// The indices of all callers, by name; the least recently used one makes room for a new one.
@@ -92,7 +95,7 @@ pub struct Indices {
     thresholds: BTreeMap<Space, Thresholds>,
     max_indices: usize,
     max_anchors: usize,
-    kept: Mutex<(BTreeMap<String, Kept>, u64)>,
+    shelf: Mutex<Shelf>,
 }
 
 impl Indices {
@@ -103,52 +106,54 @@ impl Indices {
         max_indices: usize,
         max_anchors: usize,
     ) -> Self {
-        Indices { settings, thresholds, max_indices, max_anchors, kept: Mutex::default() }
+        Indices { settings, thresholds, max_indices, max_anchors, shelf: Mutex::default() }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Shelf> {
+        self.shelf.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// An index that is here.
     pub fn get(&self, name: &str) -> Option<Arc<RwLock<PlaceIndex>>> {
-        let mut guard = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let (kept, clock) = &mut *guard;
+        let Shelf { indices, clock } = &mut *self.lock();
         *clock += 1;
-        let found = kept.get_mut(name)?;
-        found.last_used = *clock;
-        Some(found.index.clone())
+        let (last_used, index) = indices.get_mut(name)?;
+        *last_used = *clock;
+        Some(index.clone())
     }
 
     /// An index, made where it is not here.
     pub fn get_or_make(&self, name: &str) -> Arc<RwLock<PlaceIndex>> {
-        if let Some(found) = self.get(name) {
-            return found;
+        let Shelf { indices, clock } = &mut *self.lock();
+        *clock += 1;
+        if let Some((last_used, index)) = indices.get_mut(name) {
+            *last_used = *clock;
+            return index.clone();
         }
-        let mut guard = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        let (kept, clock) = &mut *guard;
-        if kept.len() >= self.max_indices
-            && !kept.contains_key(name)
-            && let Some(oldest) = kept.iter().min_by_key(|(_, k)| k.last_used).map(|(name, _)| name.clone())
+        if indices.len() >= self.max_indices
+            && let Some(oldest) =
+                indices.iter().min_by_key(|(_, (used, _))| *used).map(|(name, _)| name.clone())
         {
             warn!(
                 dropped = oldest,
                 max_indices = self.max_indices,
                 "the least recently used index made room"
             );
-            kept.remove(&oldest);
+            indices.remove(&oldest);
         }
-        *clock += 1;
-        let last_used = *clock;
-        let made = || PlaceIndex {
+        let index = Arc::new(RwLock::new(PlaceIndex {
             candidates: Candidates::new(self.settings, self.thresholds.clone()),
             comparable: self.thresholds.keys().cloned().collect(),
             spaces: BTreeMap::new(),
             max_anchors: self.max_anchors,
-        };
-        let entry = kept.entry(name.to_owned());
-        entry.or_insert_with(|| Kept { index: Arc::new(RwLock::new(made())), last_used }).index.clone()
+        }));
+        indices.insert(name.to_owned(), (*clock, index.clone()));
+        index
     }
 
     /// Anchors over all indices.
     pub fn anchors(&self) -> usize {
-        let guard = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        guard.0.values().map(|k| k.index.read().unwrap_or_else(PoisonError::into_inner).len()).sum()
+        let indices: Vec<_> = self.lock().indices.values().map(|(_, index)| index.clone()).collect();
+        indices.iter().map(|index| index.read().unwrap_or_else(PoisonError::into_inner).len()).sum()
     }
 }

@@ -16,12 +16,12 @@ mod picture;
 mod service;
 
 pub use config::{MAX_MODELS, OnnxSettings, PlaceRecognitionConfig};
+pub use encoders::{Encoders, Named};
 
 use anyhow::Context;
 use coma_runtime::{Bound, ByteLedger, Services};
 use coma_wire::v1::place_recognition_server::PlaceRecognitionServer;
 use coma_wire::{FILE_DESCRIPTOR_SET, Limited};
-use encoders::Encoders;
 use indices::Indices;
 use service::PlaceService;
 use std::net::SocketAddr;

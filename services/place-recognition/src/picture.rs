@@ -14,6 +14,14 @@ pub struct Picture {
     depth: Option<Bytes>,
 }
 
+/// A decoded picture.
+pub struct Decoded {
+    /// sRGB.
+    pub color: Image<[u8; 3]>,
+    /// Metres, 0 = no measurement; of the same size.
+    pub depth_m: Option<Image<f32>>,
+}
+
 impl Picture {
     /// Checks what can be checked without decoding.
     pub fn from_wire(request: v1::DescribeRequest, max_pixels: usize) -> Result<Self, FieldError> {
@@ -31,10 +39,10 @@ impl Picture {
     }
 
     /// Decodes colour, and depth where there is some.
-    pub fn decode(&self) -> Result<(Image<[u8; 3]>, Option<Image<f32>>), FieldError> {
+    pub fn decode(&self) -> Result<Decoded, FieldError> {
         let color = decode_color(&self.color, &self.camera)?;
-        let depth = self.depth.as_ref().map(|bytes| decode_depth(bytes, &self.camera)).transpose()?;
-        Ok((color, depth))
+        let depth_m = self.depth.as_ref().map(|bytes| decode_depth(bytes, &self.camera)).transpose()?;
+        Ok(Decoded { color, depth_m })
     }
 }
 

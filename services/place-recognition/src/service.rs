@@ -2,7 +2,7 @@
 
 use crate::encoders::Encoders;
 use crate::indices::{Anchor, Full, Indices};
-use crate::picture::Picture;
+use crate::picture::{Decoded, Picture};
 use coma_geometry::SubmapId;
 use coma_place::Descriptor;
 use coma_wire::v1::place_recognition_server::PlaceRecognition;
@@ -104,7 +104,7 @@ impl PlaceRecognition for PlaceService {
         let descriptors = self
             .work(move || {
                 let begin = Instant::now();
-                let (color, depth_m) = picture.decode()?;
+                let Decoded { color, depth_m } = picture.decode()?;
                 let descriptors = encoders
                     .describe(&color, depth_m.as_ref())
                     .map_err(|e| FieldError::new("color", e.to_string()))?;

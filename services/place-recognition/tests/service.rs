@@ -9,6 +9,7 @@ use coma_place_recognition::{Handle, PlaceRecognitionConfig, Server};
 use coma_runtime::{ByteLedger, Channel, Class, channel};
 use coma_wire::v1::place_recognition_client::PlaceRecognitionClient;
 use coma_wire::{Wire, field_errors_of, v1};
+use std::path::PathBuf;
 use std::sync::LazyLock;
 use tonic::{Code, Status};
 
@@ -136,7 +137,7 @@ async fn bad_pictures_are_refused_by_field_and_the_service_goes_on() {
     let (handle, mut client) = start(config).await;
     let good = describe_request(&frame(0));
     let camera = |f: &dyn Fn(&mut v1::Intrinsics)| {
-        let mut camera = good.camera.clone().unwrap();
+        let mut camera = good.camera.unwrap();
         f(&mut camera);
         Some(camera)
     };
@@ -246,16 +247,72 @@ async fn agents_without_a_common_space_are_named() {
     handle.shutdown().await;
 }
 
+/// A model's manifest.
+fn manifest(model: &str, input: &str, output: &str, side: u32, dimension: u32) -> String {
+    format!(
+        r#"
+model = "{model}"
+[input]
+name = "{input}"
+width = {side}
+height = {side}
+mean = [0.485, 0.456, 0.406]
+std = [0.229, 0.224, 0.225]
+[output]
+name = "{output}"
+dimension = {dimension}
+[thresholds]
+theta_sim = 0.6
+theta_multi = 0.5
+"#
+    )
+}
+
+/// The shared folder: `COMA_SHARED`, or `shared` beside one of the folders above this crate.
+fn shared() -> PathBuf {
+    if let Some(folder) = std::env::var_os("COMA_SHARED") {
+        return folder.into();
+    }
+    let start = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let found = start.ancestors().map(|folder| folder.join("shared")).find(|s| s.join("data").is_dir());
+    found.expect("a folder shared/data beside the repository, or COMA_SHARED")
+}
+
+#[tokio::test]
+#[ignore = "needs ONNX Runtime and the shared model"]
+async fn a_model_describes_beside_the_builtin_encoder_and_finds_places() {
+    let folder = tempfile::tempdir().unwrap();
+    let model = shared().join("models/dinov2s14_block8_gem_224.onnx");
+    let text = manifest(model.to_str().unwrap(), "pixel_values", "embedding", 224, 384);
+    std::fs::write(folder.path().join("dinov2.toml"), text).unwrap();
+    let config = PlaceRecognitionConfig {
+        data: folder.path().into(),
+        models: vec!["dinov2.toml".into()],
+        ..Default::default()
+    };
+    let (handle, mut client) = start(config).await;
+    let answer = client.get_encoders(v1::GetEncodersRequest {}).await.unwrap().into_inner();
+    assert_eq!(answer.warnings, [""; 0]);
+    let known: Vec<_> = answer.encoders.iter().map(|e| (e.name.as_str(), e.dimension)).collect();
+    assert_eq!(known, [("builtin", 221), ("dinov2", 384)]);
+    let first = describe(&mut client, 0).await;
+    let spaces =
+        |descriptors: &[v1::Descriptor]| descriptors.iter().map(|d| d.space.clone()).collect::<Vec<_>>();
+    assert_eq!(spaces(&first), answer.encoders.iter().map(|e| e.space.clone()).collect::<Vec<_>>());
+    // An anchor with the model's descriptor alone meets the other in that space.
+    let anchors = vec![anchor("a", 0, first), anchor("b", 0, describe(&mut client, 3).await[1..].to_vec())];
+    client.insert(insert("i", anchors)).await.unwrap();
+    let found = client.query(query("i", id("b", 0))).await.unwrap().into_inner();
+    assert_eq!(found.candidates[0].space, answer.encoders[1].space);
+    assert!(found.candidates[0].similarity > 0.8, "{found:?}");
+    handle.shutdown().await;
+}
+
 #[tokio::test]
 async fn models_that_cannot_be_loaded_leave_the_builtin_encoder_at_work() {
     let folder = tempfile::tempdir().unwrap();
-    let manifest = "model = \"m.onnx\"\n[input]\nname = \"x\"\nwidth = 8\nheight = 8\nmean = [0, 0, 0]\nstd = [1, 1, 1]\n\
-                    [output]\nname = \"y\"\ndimension = 4\n[thresholds]\ntheta_sim = 0.5\ntheta_multi = 0.5\n";
-    std::fs::write(
-        folder.path().join("m.toml"),
-        manifest.replace("[0, 0, 0]", "[0.0, 0.0, 0.0]").replace("[1, 1, 1]", "[1.0, 1.0, 1.0]"),
-    )
-    .unwrap();
+    let manifest = manifest("m.onnx", "x", "y", 8, 4);
+    std::fs::write(folder.path().join("m.toml"), manifest).unwrap();
     std::fs::write(folder.path().join("m.onnx"), b"no model").unwrap();
     let mut config = PlaceRecognitionConfig {
         data: folder.path().into(),

@@ -61,10 +61,9 @@ impl<T: DeserializeOwned, S: Send + Sync> FromRequest<S> for Json<T> {
 
 /// The field that a message of serde names, or empty, and the rest of the message.
 fn field_of(message: &str) -> (&str, &str) {
-    if message.starts_with("missing field `") || message.starts_with("unknown field `") {
-        if let Some(name) = message.split('`').nth(1) {
-            return (name, message);
-        }
+    let names_field = message.starts_with("missing field `") || message.starts_with("unknown field `");
+    if names_field && let Some(name) = message.split('`').nth(1) {
+        return (name, message);
     }
     match message.split_once(": ") {
         Some((field, rest))

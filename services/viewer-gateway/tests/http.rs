@@ -290,6 +290,34 @@ async fn the_page_and_its_files_come_from_the_program() {
     }
 }
 
+/// `npm run check` in `web/viewer` says the same, and bundles again where the packages are installed.
+#[test]
+fn the_built_page_is_made_of_its_sources() {
+    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../web/viewer");
+    let names = std::fs::read_dir(folder.join("src")).unwrap();
+    let mut names: Vec<String> =
+        names.map(|file| format!("src/{}", file.unwrap().file_name().into_string().unwrap())).collect();
+    names.sort();
+    let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+    let mut update = |bytes: &[u8]| {
+        // FNV-1a
+        bytes.iter().for_each(|byte| hash = (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3));
+    };
+    for name in ["build.js".to_owned(), "package-lock.json".to_owned()].iter().chain(&names) {
+        let bytes = std::fs::read(folder.join(name)).unwrap();
+        update(format!("{name} {}\n", bytes.len()).as_bytes());
+        update(&bytes);
+    }
+    let built = std::fs::read_to_string(folder.join("dist/sources.txt")).unwrap();
+    let expected = format!("{hash:016x}");
+    assert_eq!(built.trim(), expected, "run `npm ci && npm run build` in web/viewer and commit dist");
+    let size: u64 = std::fs::read_dir(folder.join("dist"))
+        .unwrap()
+        .map(|file| file.unwrap().metadata().unwrap().len())
+        .sum();
+    assert!(size < 1_500_000, "{size} bytes");
+}
+
 #[tokio::test]
 async fn events_begin_with_again_and_listeners_are_counted() {
     let gateway = start(GatewayConfig { max_listeners: 1, ..config() }).await;

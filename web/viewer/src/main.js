@@ -6,7 +6,7 @@ import { View } from "./view.js";
 
 const { $ } = panel;
 /** Between two looks at agents and submaps that still grow. */
-const POLL_MS = 1500;
+const POLL_MS = 2000;
 const FETCHES_AT_ONCE = 3;
 
 const state = new State();
@@ -19,7 +19,7 @@ const coma = {
   view,
   /** By submap: how often its surfels were downloaded. */
   downloads: {},
-  corrections: 0,
+  on,
   get counts() {
     const trajectories = {};
     for (const [agent, poses] of state.poses) trajectories[agent] = poses.length;
@@ -37,7 +37,7 @@ const coma = {
 };
 window.coma = coma;
 
-/** Runs `work` soon, and not again while it is waiting or under way. */
+/** Runs `work` after so many milliseconds, and not again while it is waiting or under way. */
 function soon(work, after) {
   let [waiting, running, again] = [false, false, false];
   const run = async () => {
@@ -58,7 +58,7 @@ function soon(work, after) {
     if (running) again = true;
     else if (!waiting) {
       waiting = true;
-      setTimeout(run, after);
+      setTimeout(run, typeof after === "function" ? after() : after);
     }
   };
   return start;
@@ -77,7 +77,8 @@ const redraw = soon(() => {
   panel.map(state, view);
   panel.loops(state);
   panel.hint(state);
-}, 120);
+  // A machine that draws slowly has other things to do as well.
+}, () => Math.min(Math.max(120, 3 * view.frameMs), 5000));
 
 const getAgents = soon(async () => {
   state.setAgents((await json("api/v1/agents")).agents);
@@ -147,7 +148,6 @@ function on(event) {
       getSurfels();
       return redraw();
     case "correction":
-      coma.corrections++;
       state.correct(event.component);
       redraw();
       // Submaps after the cut are placed by their agent, and the graph has new weights.
@@ -180,6 +180,7 @@ const render = soon(async () => {
   const { clientWidth, clientHeight } = $("scene");
   const viewpoint = view.viewpoint(width, Math.max(8, Math.round((width * clientHeight) / clientWidth)));
   if (!viewpoint) return;
+  $("rendering").hidden = false;
   $("rendering-note").textContent = "rendering ...";
   const begin = performance.now();
   try {
@@ -187,10 +188,9 @@ const render = soon(async () => {
     const picture = await (await ask("api/v1/render", { method: "POST", body })).blob();
     if (pictureUrl) URL.revokeObjectURL(pictureUrl);
     pictureUrl = URL.createObjectURL(picture);
-    $("rendering").src = pictureUrl;
-    $("rendering").hidden = false;
+    $("picture").src = pictureUrl;
     const { width: w, height: h } = viewpoint.camera;
-    $("rendering-note").textContent = `${w} x ${h}, map ${viewpoint.map}, ${Math.round(performance.now() - begin)} ms`;
+    $("rendering-note").textContent = `${w} x ${h}, ${Math.round(performance.now() - begin)} ms`;
   } catch (error) {
     $("rendering-note").textContent = error.message;
     if (error instanceof TokenNeeded) failed(error);
@@ -218,6 +218,10 @@ $("save-map").addEventListener("click", () => saved("api/v1/map.ply", "map.ply")
 $("save-graph").addEventListener("click", () => saved("api/v1/graph", "graph.json"));
 $("render").addEventListener("click", render);
 $("output").addEventListener("change", render);
+$("close-rendering").addEventListener("click", () => {
+  $("rendering").hidden = true;
+  $("follow").checked = false;
+});
 view.onMoved(() => $("follow").checked && render());
 $("token").addEventListener("submit", (event) => {
   event.preventDefault();

@@ -34,29 +34,23 @@ export function agents(state, { focus, save }) {
     const name = agent.id ?? agent.endpoint;
     const title = element("button", { textContent: name, title: "Go to its camera" });
     title.addEventListener("click", () => agent.id && focus(agent.id));
-    const stateName = agent.reachable ? status?.state ?? "unknown" : "unreachable";
+    // An agent that has no frames yet has nothing to track.
+    const stateName = !agent.reachable ? "unreachable" : status?.frames_processed ? status.state : "waiting";
     const card = element("li", { className: "agent" }, element("div", { className: "name" }, title, element("span", { className: `chip ${stateName}`, textContent: stateName })));
     card.style.setProperty("--color", agent.id ? state.color(agent.id) : "var(--quiet)");
     if (status) {
       const between = status.bytes_sent.filter((b) => b.class === "peer" || b.class === "gossip").reduce((sum, b) => sum + b.bytes, 0);
       const alive = status.peers.filter((peer) => peer.alive).length;
       const generation = status.generation;
-      const rows = [
-        ["frames", number(status.frames_processed) + (status.frames_dropped ? ` (${number(status.frames_dropped)} dropped)` : "")],
-        ["submaps", number(status.submaps)],
-        ["surfels", number(status.surfels)],
-        ["sent to peers", bytes(between)],
-        ["peers", `${alive} of ${status.peers.length} alive`],
-        ["map", generation ? generation.map : "its own"],
-        ["generation", generation ? generation.digest.slice(0, 10) : "none yet"],
+      const figures = [
+        ["frames", number(status.frames_processed), status.frames_dropped ? `${status.frames_dropped} more were dropped` : ""],
+        ["submaps", number(status.submaps), ""],
+        ["surfels", number(status.surfels), `${status.surfels}`],
+        ["to peers", bytes(between), "Bytes that it sent to other agents"],
+        ["peers", `${alive} of ${status.peers.length}`, status.peers.map((p) => `${p.id ?? p.endpoint}: ${p.alive ? "answers" : p.error}`).join("\n")],
+        ["generation", generation ? generation.digest.slice(0, 8) : "none", generation ? `Map ${generation.map}, from ${Object.values(generation.cut).reduce((a, b) => a + b, 0)} entries` : "No result of the graph places it yet"],
       ];
-      const table = element("table");
-      for (const [what, value] of rows) {
-        const row = table.insertRow();
-        row.insertCell().textContent = what;
-        row.insertCell().textContent = value;
-      }
-      card.append(table);
+      card.append(element("dl", {}, ...figures.map(([what, value, title]) => element("div", { title }, element("dt", { textContent: what }), element("dd", { textContent: value })))));
       for (const warning of status.warnings) card.append(element("p", { className: "note", textContent: warning }));
       if (agent.reachable) {
         const tum = element("button", { textContent: "trajectory.tum" });
@@ -118,7 +112,7 @@ export function hint(state) {
   const reachable = state.agents.filter((agent) => agent.reachable);
   if (state.submaps.size) $("hint").hidden = true;
   else if (!state.agents.length) {
-    show("No agents are known", "Name them when the gateway starts:", "$ coma gateway --config gateway.toml     # agents = [\"http://robot-1:7001\"]", "Or see the whole cluster on a built-in world:", "$ coma demo");
+    show("No agents are known", "Name them when the gateway starts:", "$ coma gateway --agent http://robot-1:7001", "Or see the whole cluster on a built-in world:", "$ coma demo");
   } else if (!reachable.length) {
     show("No agent answers", "They are asked again every second. The panel says what went wrong with each.");
   } else {

@@ -1,7 +1,7 @@
 // Surfels as oriented discs. A submap's surfels stay on the graphics card in the submap's own frame; where the
 // submap lies is its object's matrix, so a correction of the map moves it and sends nothing.
 import {
-  BufferAttribute, Color, DoubleSide, InstancedBufferAttribute, InstancedBufferGeometry, Mesh,
+  BufferAttribute, Color, InstancedBufferAttribute, InstancedBufferGeometry, Mesh,
   ShaderMaterial, Sphere, Vector3,
 } from "three";
 import { unpack } from "./pack.js";
@@ -9,6 +9,9 @@ import { unpack } from "./pack.js";
 // A disc is drawn to this many standard deviations, and where it is at least so opaque.
 const EXTENT = 2.0;
 const ALPHA_MIN = 0.2;
+// A disc's rim is drawn so many standard deviations farther away than its middle: where discs overlap, each shows
+// around its own middle.
+const CONE = 1.0;
 
 const vertexShader = /* glsl */ `
 in vec3 center;
@@ -24,7 +27,10 @@ void main() {
   onDisc = position.xy * ${EXTENT.toFixed(1)};
   vec3 inSubmap = center + rotated(vec3(onDisc * scale, 0.0), normalize(rotation));
   shade = surfelColor;
-  gl_Position = projectionMatrix * modelViewMatrix * vec4(inSubmap, 1.0);
+  vec3 seen = (modelViewMatrix * vec4(inSubmap, 1.0)).xyz;
+  // Along the line of sight: the picture of the disc stays the same.
+  seen *= 1.0 + position.z * ${CONE.toFixed(1)} * max(scale.x, scale.y) / max(length(seen), 1e-3);
+  gl_Position = projectionMatrix * vec4(seen, 1.0);
 }`;
 
 const fragmentShader = /* glsl */ `
@@ -40,8 +46,9 @@ void main() {
   pixel = vec4(mix(shade.rgb, tint * (0.25 + 0.75 * light), tinted), 1.0);
 }`;
 
-const corners = new BufferAttribute(new Float32Array([-1, -1, 0, 1, -1, 0, 1, 1, 0, -1, 1, 0]), 3);
-const sides = new BufferAttribute(new Uint16Array([0, 1, 2, 0, 2, 3]), 1);
+/** Four corners, z = 1, around a middle, z = 0. */
+const corners = new BufferAttribute(new Float32Array([-1, -1, 1, 1, -1, 1, 1, 1, 1, -1, 1, 1, 0, 0, 0]), 3);
+const sides = new BufferAttribute(new Uint16Array([0, 1, 4, 1, 2, 4, 2, 3, 4, 3, 0, 4]), 1);
 
 /** One submap's surfels as an object; its matrix is set by whoever knows where the submap lies. */
 export function surfelObject(buffer, agentColor) {
@@ -58,7 +65,6 @@ export function surfelObject(buffer, agentColor) {
   const material = new ShaderMaterial({
     vertexShader,
     fragmentShader,
-    side: DoubleSide,
     uniforms: { tint: { value: new Color(agentColor) }, tinted: { value: 0 } },
     glslVersion: "300 es",
   });

@@ -30,6 +30,8 @@ export class View {
   shown = { surfels: true, trajectories: true, cameras: true, accepted: true, rejected: false, tint: false };
   budget = 2 ** 21;
   drawnSurfels = 0;
+  /** What drawing took the last time, milliseconds. */
+  frameMs = 0;
   #state;
   #scene = new Scene();
   #root = new Group();
@@ -72,7 +74,9 @@ export class View {
     requestAnimationFrame(() => {
       this.#wanted = false;
       this.#share();
+      const begin = performance.now();
       this.renderer.render(this.#scene, this.camera);
+      requestAnimationFrame(() => (this.frameMs = performance.now() - begin));
     });
   }
 
@@ -88,6 +92,19 @@ export class View {
   /** The revision of a submap's surfels that is here. */
   revision(id) {
     return this.#surfels.get(id)?.revision;
+  }
+
+  /** Where a submap's surfels are drawn, in their map. */
+  surfelMatrix(id) {
+    return this.#surfels.get(id)?.object.matrix;
+  }
+
+  /** A submap's first surfel as the graphics card has it: centre, rotation x y z w, scales, colour and opacity. */
+  firstSurfel(id) {
+    const { geometry } = this.#surfels.get(id).object;
+    const columns = { center: 3, rotation: 4, scale: 2, surfelColor: 4 };
+    const read = (name) => Array.from({ length: columns[name] }, (_, k) => geometry.getAttribute(name).getComponent(0, k));
+    return { center: read("center"), rotation: read("rotation"), scale: read("scale"), color: read("surfelColor") };
   }
 
   get surfels() {
@@ -157,23 +174,30 @@ export class View {
     this.draw();
   }
 
-  /** Brings everything into view. */
+  /** Brings everything into view, a few far strays aside. */
   fit() {
-    const box = new Box3();
+    const [points, cameras] = [[], new Box3()];
     for (const map of this.#state.maps()) {
       const group = this.#maps.get(map.id);
       for (const submap of map.submaps) {
-        box.expandByPoint(new Vector3().setFromMatrixPosition(this.#world(group, submap)));
+        cameras.expandByPoint(new Vector3().setFromMatrixPosition(this.#world(group, submap)));
         const object = this.#surfels.get(submap.id)?.object;
-        if (object) box.union(sample(object));
+        if (object) points.push(...sample(object));
       }
     }
-    if (box.isEmpty()) return;
+    if (cameras.isEmpty()) return;
+    const box = cameras.clone();
+    for (const axis of points.length ? ["x", "y", "z"] : []) {
+      const sorted = points.map((point) => point[axis]).sort((a, b) => a - b);
+      const stray = Math.floor(0.02 * sorted.length);
+      box.min[axis] = Math.min(box.min[axis], sorted[stray]);
+      box.max[axis] = Math.max(box.max[axis], sorted[sorted.length - 1 - stray]);
+    }
     const center = box.getCenter(new Vector3());
     const radius = Math.max(box.getSize(new Vector3()).length() / 2, 0.8);
-    const from = new Vector3(0.45, 0.75, 1).normalize().multiplyScalar(radius / Math.sin((this.camera.fov * Math.PI) / 360));
+    const away = (0.85 * radius) / Math.sin((this.camera.fov * Math.PI) / 360);
     this.controls.target.copy(center);
-    this.camera.position.copy(center).add(from);
+    this.camera.position.copy(center).add(new Vector3(-0.35, 0.6, 1).setLength(away));
     this.controls.update();
     this.draw();
   }
@@ -301,14 +325,12 @@ export class View {
   }
 }
 
-/** Some of an object's centres in the world: enough for a box. */
+/** Some of an object's centres in the world. */
 function sample(object) {
-  const box = new Box3();
   const { array, count } = object.geometry.getAttribute("center");
-  const point = new Vector3();
   object.updateWorldMatrix(true, false);
-  for (let i = 0; i < Math.min(count, 500); i++) box.expandByPoint(point.fromArray(array, 3 * i).applyMatrix4(object.matrixWorld));
-  return box;
+  const some = Math.min(count, 500);
+  return Array.from({ length: some }, (_, i) => new Vector3().fromArray(array, 3 * i).applyMatrix4(object.matrixWorld));
 }
 
 /** A camera's pyramid as line segments. */

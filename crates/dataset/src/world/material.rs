@@ -104,7 +104,8 @@ impl Material {
                 let vein = step(p.abs() - 0.012, 0.01 + w * 6.0);
                 let shade = 1.0 + 0.10 * octaves(a, b, 0.3, 5, w, seed ^ 9);
                 let fade = (0.12 / w - 1.0).clamp(0.0, 1.0);
-                let printed = step(inside, 0.06 + w * 6.0) * (0.5 + 0.5 * vein) * (0.6 + 0.4 * unit(leaf_seed, 3));
+                let printed =
+                    step(inside, 0.06 + w * 6.0) * (0.5 + 0.5 * vein) * (0.6 + 0.4 * unit(leaf_seed, 3));
                 scaled(mix(base, leaf, 0.3 + fade * (printed - 0.3)), shade)
             }
             Material::Wood(light, dark, plank_m, along_a) => {
@@ -126,7 +127,8 @@ impl Material {
                 let (inner_a, inner_b) = (at.half.0 - a.abs(), at.half.1 - b.abs());
                 let rim = inner_a.min(inner_b);
                 // Mirrored in both axes, as woven carpets are, but worn differently everywhere.
-                let figure = value(a.abs() / 0.11, b.abs() / 0.11, seed) + 0.6 * value(a / 0.31, b / 0.31, seed ^ 1);
+                let figure =
+                    value(a.abs() / 0.11, b.abs() / 0.11, seed) + 0.6 * value(a / 0.31, b / 0.31, seed ^ 1);
                 let mut colour = mix(ground, ornament, step(figure, 0.12 + w * 6.0));
                 colour = mix(border, colour, step(rim - 0.16, 0.003 + w * 0.5));
                 let band = step((rim - 0.10).abs() - 0.02, 0.003 + w * 0.5);
@@ -139,7 +141,10 @@ impl Material {
             }
             Material::Print(ground, figure) => {
                 let shape = value(a / 0.06, b / 0.06, seed) + 0.5 * value(a / 0.025, b / 0.025, seed ^ 1);
-                scaled(mix(ground, figure, step(shape, 0.1 + w * 8.0)), 1.0 + 0.1 * octaves(a, b, 0.03, 3, w, seed))
+                scaled(
+                    mix(ground, figure, step(shape, 0.1 + w * 8.0)),
+                    1.0 + 0.1 * octaves(a, b, 0.03, 3, w, seed),
+                )
             }
             Material::Tiles(light, dark, side_m) => {
                 let (ta, tb) = ((a / side_m).floor(), (b / side_m).floor());
@@ -156,7 +161,10 @@ impl Material {
                 let band_at = at.half.1 * (0.3 + 1.5 * unit(seed, 1));
                 let band = 1.0 - step((height - band_at).abs() - 0.012, 0.002 + w * 0.5);
                 let label = 1.0
-                    - step((b - at.half.1 * (0.4 * unit(seed, 2) - 0.1)).abs() - at.half.1 * 0.3, 0.002 + w * 0.5);
+                    - step(
+                        (b - at.half.1 * (0.4 * unit(seed, 2) - 0.1)).abs() - at.half.1 * 0.3,
+                        0.002 + w * 0.5,
+                    );
                 let letters = step(value(a / 0.008, b / 0.006, seed ^ 4) - 0.1, 0.3 + w * 40.0);
                 let gold: Rgb = if unit(seed, 5) > 0.5 { [0.62, 0.5, 0.22] } else { [0.75, 0.73, 0.66] };
                 mix(mix(worn, gold, band * 0.8), gold, label * letters * 0.6)
@@ -173,10 +181,8 @@ impl Material {
                 // A few painted shapes.
                 for i in 0..5u32 {
                     let s = hash(seed, 40 + i);
-                    let (ca, cb) = (
-                        at.half.0 * (1.4 * unit(s, 1) - 0.7),
-                        at.half.1 * (1.4 * unit(s, 2) - 0.7),
-                    );
+                    let (ca, cb) =
+                        (at.half.0 * (1.4 * unit(s, 1) - 0.7), at.half.1 * (1.4 * unit(s, 2) - 0.7));
                     let (ra, rb) = (0.04 + 0.09 * unit(s, 3), 0.04 + 0.12 * unit(s, 4));
                     let inside = if i % 2 == 0 {
                         1.0 - ((a - ca) / ra).hypot((b - cb) / rb)
@@ -197,7 +203,8 @@ impl Material {
                 mix([0.8, 0.79, 0.75], [0.12, 0.12, 0.16], ink * step(rim - 0.018, 0.003) * 0.8)
             }
             Material::Screen => {
-                let mut colour = mix([0.03, 0.05, 0.10], [0.05, 0.14, 0.18], 0.5 + 0.5 * octaves(a, b, 0.2, 3, w, seed));
+                let mut colour =
+                    mix([0.03, 0.05, 0.10], [0.05, 0.14, 0.18], 0.5 + 0.5 * octaves(a, b, 0.2, 3, w, seed));
                 for i in 0..4u32 {
                     let s = hash(seed, i);
                     let (ca, cb) = (at.half.0 * (unit(s, 1) - 0.5), at.half.1 * (unit(s, 2) - 0.5));
@@ -218,9 +225,18 @@ impl Material {
                 scaled(mix(base, ring, step(wave - 0.3, 0.15 + w * 20.0)), glaze)
             }
             Material::Window => {
-                let horizon = -0.15 + 0.12 * value(a / 0.25, 0.5, seed) + 0.04 * value(a / 0.06, 0.5, seed ^ 1);
-                let sky = mix([0.55, 0.68, 0.9], [0.95, 0.95, 0.95], 0.4 + 0.8 * octaves(a, b * 2.0, 0.5, 4, w, seed));
-                let trees = mix([0.10, 0.18, 0.06], [0.32, 0.42, 0.16], 0.5 + 0.9 * octaves(a, b, 0.1, 4, w, seed ^ 2));
+                let horizon =
+                    -0.15 + 0.12 * value(a / 0.25, 0.5, seed) + 0.04 * value(a / 0.06, 0.5, seed ^ 1);
+                let sky = mix(
+                    [0.55, 0.68, 0.9],
+                    [0.95, 0.95, 0.95],
+                    0.4 + 0.8 * octaves(a, b * 2.0, 0.5, 4, w, seed),
+                );
+                let trees = mix(
+                    [0.10, 0.18, 0.06],
+                    [0.32, 0.42, 0.16],
+                    0.5 + 0.9 * octaves(a, b, 0.1, 4, w, seed ^ 2),
+                );
                 mix(trees, sky, step(b - horizon, 0.01 + w))
             }
             Material::Lamp => [1.0, 0.95, 0.85],

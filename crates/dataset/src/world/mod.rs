@@ -80,7 +80,7 @@ impl World {
             return refuse("frames", settings.frames as f64, "1 to 1000000");
         }
         let fps = settings.frames_per_second;
-        if !(fps.is_finite() && fps >= 0.1 && fps <= 1000.0) {
+        if !(0.1..=1000.0).contains(&fps) {
             return refuse("frames_per_second", fps, "0.1 to 1000");
         }
         let (width, height) = (settings.width as f64, settings.height as f64);
@@ -173,7 +173,8 @@ impl Sequence for WorldSequence {
             return Err(DatasetError::NoSuchFrame { index, len: self.len() });
         }
         let (scene, light) = &*self.world.stage;
-        let picture = render::render(scene, light, &self.calibration.color, &self.tour.world_from_camera(index));
+        let picture =
+            render::render(scene, light, &self.calibration.color, &self.tour.world_from_camera(index));
         let seed = noise::hash(self.world.settings.seed as u32, 1000 + self.agent as u32);
         let (color, depth) = sensor::expose(
             &picture,

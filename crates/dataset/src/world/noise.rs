@@ -20,7 +20,7 @@ pub fn unit(a: u32, b: u32) -> f32 {
 /// A standard normal value (Box and Muller 1958).
 #[inline]
 pub fn normal(a: u32, b: u32) -> f32 {
-    let (u, v) = (unit(a, b).max(1e-7), unit(a ^ 0x5bd1_e995, b.wrapping_add(0x1234_567)));
+    let (u, v) = (unit(a, b).max(1e-7), unit(a ^ 0x5bd1_e995, b.wrapping_add(0x0123_4567)));
     (-2.0 * u.ln()).sqrt() * (std::f32::consts::TAU * v).cos()
 }
 
@@ -47,7 +47,8 @@ pub fn octaves(x_m: f32, y_m: f32, wavelength_m: f32, count: u32, footprint_m: f
         if visible <= 0.0 {
             break;
         }
-        sum += visible * amplitude * value(x_m / wavelength, y_m / wavelength, seed.wrapping_add(octave * 7919));
+        sum +=
+            visible * amplitude * value(x_m / wavelength, y_m / wavelength, seed.wrapping_add(octave * 7919));
         amplitude *= 0.72;
         wavelength *= 0.45;
     }

@@ -29,7 +29,12 @@ struct Sample {
 const OFFSETS: [(f64, f64); 4] = [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)];
 
 /// Ray-traces one picture.
-pub fn render(scene: &Scene, light: &LightMap, camera: &Intrinsics, world_from_camera: &Pose) -> CleanPicture {
+pub fn render(
+    scene: &Scene,
+    light: &LightMap,
+    camera: &Intrinsics,
+    world_from_camera: &Pose,
+) -> CleanPicture {
     let (width, height) = (camera.width as usize, camera.height as usize);
     let origin: V3 = world_from_camera.translation.vector.cast();
     let rotation = world_from_camera.rotation;
@@ -59,8 +64,12 @@ pub fn render(scene: &Scene, light: &LightMap, camera: &Intrinsics, world_from_c
             let same = |x: usize, y: usize| samples[y * width + x].surface == here.surface;
             let inside = x > 0 && y > 0 && x + 1 < width && y + 1 < height;
             // Away from edges all four rays meet the surface that the centre met.
-            let uniform =
-                inside && same(x - 1, y) && same(x + 1, y) && same(x, y - 1) && same(x, y + 1) && here.hit.is_some();
+            let uniform = inside
+                && same(x - 1, y)
+                && same(x + 1, y)
+                && same(x, y - 1)
+                && same(x, y + 1)
+                && here.hit.is_some();
             let mut sum = [0.0f32; 3];
             // Light varies over decimetres: one look-up serves a pixel that shows one surface.
             let mut shared_brightness = None;
@@ -85,9 +94,8 @@ pub fn render(scene: &Scene, light: &LightMap, camera: &Intrinsics, world_from_c
             *out = sum;
         }
     });
-    let image = |value: &dyn Fn(&Sample) -> f32| {
-        Image::from_fn(width, height, |x, y| value(&samples[y * width + x]))
-    };
+    let image =
+        |value: &dyn Fn(&Sample) -> f32| Image::from_fn(width, height, |x, y| value(&samples[y * width + x]));
     CleanPicture {
         depth_m: image(&|s| s.hit.map_or(0.0, |hit| hit.t)),
         facing: image(&|s| s.facing),

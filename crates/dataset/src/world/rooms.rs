@@ -145,7 +145,11 @@ impl Builder {
             let up = z + 0.5 + (height - 0.6) * (i as f32 / 8.0);
             let green: Rgb = [0.10 + 0.08 * self.random(2), 0.28 + 0.14 * self.random(3), 0.09];
             let radius = 0.08 + 0.07 * self.random(4);
-            self.ball([x + reach * angle.cos(), y + reach * angle.sin(), up], radius, Material::Leaves(green));
+            self.ball(
+                [x + reach * angle.cos(), y + reach * angle.sin(), up],
+                radius,
+                Material::Leaves(green),
+            );
         }
     }
 
@@ -155,7 +159,12 @@ impl Builder {
         let (c, s) = (turn_deg.to_radians().cos(), turn_deg.to_radians().sin());
         for (i, j) in [(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)] {
             let (a, b) = (i * (size[0] * 0.5 - 0.05), j * (size[1] * 0.5 - 0.05));
-            self.turned([x + c * a - s * b, y + s * a + c * b, 0.0], [0.05, 0.05, height - 0.04], turn_deg, wood);
+            self.turned(
+                [x + c * a - s * b, y + s * a + c * b, 0.0],
+                [0.05, 0.05, height - 0.04],
+                turn_deg,
+                wood,
+            );
         }
     }
 
@@ -199,9 +208,17 @@ fn shell(b: &mut Builder) {
     // Outer walls.
     b.block([-0.2, -0.2, 0.0], [0.0, 4.6, HEIGHT_M], SAGE);
     b.block([-0.2, 4.6, 0.0], [0.0, 6.4, HEIGHT_M], CREAM);
-    b.block([0.0, -0.2, 0.0], [5.1, 0.0, HEIGHT_M], Material::Wallpaper([0.62, 0.56, 0.44], [0.50, 0.46, 0.32]));
+    b.block(
+        [0.0, -0.2, 0.0],
+        [5.1, 0.0, HEIGHT_M],
+        Material::Wallpaper([0.62, 0.56, 0.44], [0.50, 0.46, 0.32]),
+    );
     b.block([5.1, -0.2, 0.0], [9.4, 0.0, HEIGHT_M], SKY);
-    b.block([9.2, 0.0, 0.0], [9.4, 4.6, HEIGHT_M], Material::Wallpaper([0.36, 0.44, 0.50], [0.50, 0.55, 0.56]));
+    b.block(
+        [9.2, 0.0, 0.0],
+        [9.4, 4.6, HEIGHT_M],
+        Material::Wallpaper([0.36, 0.44, 0.50], [0.50, 0.55, 0.56]),
+    );
     b.block([9.2, 4.6, 0.0], [9.4, 6.4, HEIGHT_M], CLAY);
     b.block([0.0, 6.2, 0.0], [9.2, 6.4, HEIGHT_M], CREAM);
     // Between living room and study, with a wide opening.
@@ -228,7 +245,11 @@ fn shell(b: &mut Builder) {
 }
 
 fn living_room(b: &mut Builder) {
-    b.block([1.0, 1.05, 0.0], [3.8, 2.75, 0.012], Material::Carpet([0.40, 0.09, 0.08], [0.60, 0.48, 0.30], [0.10, 0.12, 0.24]));
+    b.block(
+        [1.0, 1.05, 0.0],
+        [3.8, 2.75, 0.012],
+        Material::Carpet([0.40, 0.09, 0.08], [0.60, 0.48, 0.30], [0.10, 0.12, 0.24]),
+    );
     // Sofa on the south wall, with cushions.
     let cloth = Material::Fabric([0.30, 0.34, 0.42]);
     b.block([1.15, 0.12, 0.08], [3.35, 0.95, 0.40], cloth);
@@ -258,9 +279,13 @@ fn living_room(b: &mut Builder) {
     b.picture([0.0, 1.3, 1.15], [0.03, 2.5, 1.95], WALNUT);
     // Window on the west wall, further north.
     b.block([0.0, 3.2, 0.9], [0.02, 4.2, 2.1], Material::Window);
-    for (y0, y1, z0, z1) in
-        [(3.12, 3.2, 0.82, 2.18), (4.2, 4.28, 0.82, 2.18), (3.2, 4.2, 0.82, 0.9), (3.2, 4.2, 2.1, 2.18), (3.67, 3.73, 0.9, 2.1)]
-    {
+    for (y0, y1, z0, z1) in [
+        (3.12, 3.2, 0.82, 2.18),
+        (4.2, 4.28, 0.82, 2.18),
+        (3.2, 4.2, 0.82, 0.9),
+        (3.2, 4.2, 2.1, 2.18),
+        (3.67, 3.73, 0.9, 2.1),
+    ] {
         b.block([0.0, y0, z0], [0.05, y1, z1], WHITE_WOOD);
     }
     b.block([0.0, 3.1, 0.78], [0.2, 4.3, 0.82], WHITE_WOOD);
@@ -290,7 +315,11 @@ fn living_room(b: &mut Builder) {
 }
 
 fn study(b: &mut Builder) {
-    b.block([5.9, 1.2, 0.0], [7.9, 3.2, 0.012], Material::Carpet([0.12, 0.22, 0.30], [0.55, 0.52, 0.40], [0.42, 0.16, 0.10]));
+    b.block(
+        [5.9, 1.2, 0.0],
+        [7.9, 3.2, 0.012],
+        Material::Carpet([0.12, 0.22, 0.30], [0.55, 0.52, 0.40], [0.42, 0.16, 0.10]),
+    );
     // Desk on the east wall.
     b.table([8.82, 2.0], [0.72, 1.7], 0.74, 0.0, PINE);
     b.turned([8.98, 2.0, 0.74], [0.16, 0.24, 0.02], 0.0, WALNUT);
@@ -343,7 +372,11 @@ fn study(b: &mut Builder) {
 }
 
 fn corridor(b: &mut Builder) {
-    b.block([0.8, 5.05, 0.0], [8.4, 5.85, 0.01], Material::Carpet([0.14, 0.20, 0.14], [0.52, 0.40, 0.22], [0.36, 0.10, 0.09]));
+    b.block(
+        [0.8, 5.05, 0.0],
+        [8.4, 5.85, 0.01],
+        Material::Carpet([0.14, 0.20, 0.14], [0.52, 0.40, 0.22], [0.36, 0.10, 0.09]),
+    );
     // North wall: console table, bench, cabinet, pictures.
     b.block([3.0, 5.92, 0.70], [4.3, 6.2, 0.74], WALNUT);
     for x in [3.03, 4.22] {
@@ -392,7 +425,9 @@ pub fn furnished_rooms(seed: u64) -> (Vec<Object>, Vec<LightSource>) {
     study(&mut b);
     corridor(&mut b);
     let mut sources = Vec::new();
-    for (x, y, power) in [(2.4, 2.2, 2.6), (7.2, 2.2, 2.4), (2.0, 5.45, 1.2), (5.0, 5.45, 1.2), (7.8, 5.45, 1.2)] {
+    for (x, y, power) in
+        [(2.4, 2.2, 2.6), (7.2, 2.2, 2.4), (2.0, 5.45, 1.2), (5.0, 5.45, 1.2), (7.8, 5.45, 1.2)]
+    {
         b.drum([x, y, HEIGHT_M - 0.08], 0.2, 0.07, Material::Lamp);
         sources.push(LightSource { centre: V3::new(x, y, HEIGHT_M - 0.35), radius: 0.25, power });
     }

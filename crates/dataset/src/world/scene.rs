@@ -88,11 +88,8 @@ impl Object {
             }
             Shape::Ball(radius) => quadratic(d.dot(&d), o.dot(&d), o.dot(&o) - radius * radius),
             Shape::Drum(radius, half_height) => {
-                let (a, b, c) = (
-                    d.x * d.x + d.y * d.y,
-                    o.x * d.x + o.y * d.y,
-                    o.x * o.x + o.y * o.y - radius * radius,
-                );
+                let (a, b, c) =
+                    (d.x * d.x + d.y * d.y, o.x * d.x + o.y * d.y, o.x * o.x + o.y * o.y - radius * radius);
                 let (mut near, mut far) = if a < 1e-12 {
                     if c > 0.0 {
                         return None;

@@ -88,7 +88,7 @@ pub fn expose(
             z = (z / sigma).round() * sigma;
         }
         let code = (z * depth_units_per_metre).round();
-        if code >= 1.0 && code < 65535.0 { code as u16 } else { 0 }
+        if (1.0..65535.0).contains(&code) { code as u16 } else { 0 }
     });
     (color, depth)
 }

@@ -161,11 +161,8 @@ impl Tour {
                 + (t / 7.1 + self.phase(salt + 1)).sin() * 0.2
                 + (t / 23.0 + self.phase(salt + 2)).sin())
         };
-        let position = Vector3::new(
-            place.x + shake(10, 0.008),
-            place.y + shake(20, 0.008),
-            place.z + shake(30, 0.012),
-        );
+        let position =
+            Vector3::new(place.x + shake(10, 0.008), place.y + shake(20, 0.008), place.z + shake(30, 0.012));
         let yaw = (place.yaw + round * self.turn_deg + shake(40, 0.7)).to_radians();
         let pitch = (place.pitch + shake(50, 0.8)).to_radians();
         let roll = shake(60, 1.2).to_radians();
@@ -201,13 +198,11 @@ impl Tour {
 
 /// World from camera (x right, y down, z forward) for a camera that looks along yaw and pitch.
 fn looking(yaw_rad: f64, pitch_rad: f64, roll_rad: f64) -> UnitQuaternion<f64> {
-    let forward = Vector3::new(
-        yaw_rad.cos() * pitch_rad.cos(),
-        yaw_rad.sin() * pitch_rad.cos(),
-        pitch_rad.sin(),
-    );
+    let forward =
+        Vector3::new(yaw_rad.cos() * pitch_rad.cos(), yaw_rad.sin() * pitch_rad.cos(), pitch_rad.sin());
     let right = forward.cross(&Vector3::z()).normalize();
     let down = forward.cross(&right);
     let level = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[right, down, forward]));
-    UnitQuaternion::from_rotation_matrix(&level) * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), roll_rad)
+    UnitQuaternion::from_rotation_matrix(&level)
+        * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), roll_rad)
 }

@@ -263,9 +263,8 @@ impl BlockAgent {
         self.iterations += u64::from(solved.iterations);
         // What is not at its minimum yet goes on without news.
         self.busy |= !solved.converged;
-        let to_minimum = |(node, goal): (&NodeId, &Pose)| {
-            Some((*node, se3::log(&self.poses.get(node)?.inv_mul(goal))))
-        };
+        let to_minimum =
+            |(node, goal): (&NodeId, &Pose)| Some((*node, se3::log(&self.poses.get(node)?.inv_mul(goal))));
         let steps: BTreeMap<NodeId, Tangent> = target.iter().filter_map(to_minimum).collect();
         let scale_m = local.rotation_scale_m();
         let dot = |a: &Tangent, b: &Tangent| {

@@ -56,7 +56,11 @@ impl Pair {
             let text = format!("{}|{}|{}", self.from, self.to, agent);
             *blake3::hash(text.as_bytes()).as_bytes()
         };
-        [&self.from.agent, &self.to.agent].into_iter().filter(|a| is_live(a)).max_by_key(|a| score(a)).cloned()
+        [&self.from.agent, &self.to.agent]
+            .into_iter()
+            .filter(|a| is_live(a))
+            .max_by_key(|a| score(a))
+            .cloned()
     }
 }
 
@@ -216,7 +220,9 @@ impl LoopCloser {
 
     fn accepted_by_agents(&self) -> BTreeMap<(AgentId, AgentId), u32> {
         let mut out = BTreeMap::new();
-        for (pair, _, _) in self.decided().filter(|(_, _, v)| matches!(v.outcome, LoopOutcome::Accepted { .. })) {
+        for (pair, _, _) in
+            self.decided().filter(|(_, _, v)| matches!(v.outcome, LoopOutcome::Accepted { .. }))
+        {
             *out.entry((pair.from.agent.clone(), pair.to.agent.clone())).or_insert(0) += 1;
         }
         out

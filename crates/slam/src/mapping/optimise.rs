@@ -4,10 +4,12 @@
 use super::ssim::ssim_and_gradient;
 use coma_frame::{DepthNoise, Image};
 use coma_geometry::{Intrinsics, Pose};
-use coma_raster::{PixelGradients, RenderSettings, Rendering, SubmapView, SurfelGradients};
+use coma_raster::{Outputs, PixelGradients, RenderSettings, Rendering, SubmapView, SurfelGradients};
 use coma_surfel::SurfelCloud;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use std::sync::LazyLock;
 
 /// Weights and learning rates.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -72,44 +74,63 @@ pub struct Loss {
     pub depth_l1_m: f64,
 }
 
+/// Pixels or surfels of one task.
+const PART: usize = 4096;
+
 /// Eq. 9 and its derivative by every pixel.
 pub fn loss(rendering: &Rendering, target: &Target, settings: &OptimiseSettings) -> (Loss, PixelGradients) {
     let (width, height) = (target.color.width(), target.color.height());
     let pixels = (width * height) as f32;
     let (ssim, ssim_gradient) = ssim_and_gradient(&rendering.color, &target.color);
     let l1_step = (1.0 - settings.ssim_weight) / (3.0 * pixels);
-    let mut l1 = 0.0f64;
     let mut color = ssim_gradient;
-    for (g, (c, t)) in color.pixels_mut().iter_mut().zip(rendering.color.pixels().iter().zip(target.color.pixels())) {
-        for k in 0..3 {
-            let r = c[k] - t[k];
-            l1 += r.abs() as f64;
-            // Smoothed at the size of one grey level, so that a perfect pixel stays where it is.
-            g[k] = l1_step * (r / 0.004).clamp(-1.0, 1.0) - settings.ssim_weight * g[k];
-        }
-    }
     let mut depth = Image::filled(width, height, 0.0f32);
-    let (mut depth_sum, mut depth_count) = (0.0f64, 0usize);
     let reference_sigma = target.noise.sigma_m(1.0);
-    for (i, (found, wanted)) in rendering.depth_m.pixels().iter().zip(target.depth_m.pixels()).enumerate() {
-        if !(*wanted > 0.0 && *found > 0.0 && rendering.opacity.pixels()[i] > 0.5) {
-            continue;
-        }
-        let r = found - wanted;
-        if r.abs() > settings.depth_cutoff_m {
-            continue;
-        }
-        depth_sum += r.abs() as f64;
-        depth_count += 1;
-        // Quadratic within the noise, linear beyond; far pixels count less, as they err more.
-        let sigma = target.noise.sigma_m(*wanted);
-        let weight = settings.depth_weight * reference_sigma / sigma / pixels;
-        depth.pixels_mut()[i] = weight * r / (r * r + sigma * sigma).sqrt();
-    }
+    // Parts are summed up in their order.
+    let sums: Vec<(f64, f64, usize)> = (
+        color.pixels_mut().par_chunks_mut(PART),
+        rendering.color.pixels().par_chunks(PART),
+        target.color.pixels().par_chunks(PART),
+        depth.pixels_mut().par_chunks_mut(PART),
+        rendering.depth_m.pixels().par_chunks(PART),
+        target.depth_m.pixels().par_chunks(PART),
+        rendering.opacity.pixels().par_chunks(PART),
+    )
+        .into_par_iter()
+        .map(|(by_color, color, wanted_color, by_depth, depth, wanted_depth, opacity)| {
+            let mut l1 = 0.0f64;
+            for (g, (c, t)) in by_color.iter_mut().zip(color.iter().zip(wanted_color)) {
+                for k in 0..3 {
+                    let r = c[k] - t[k];
+                    l1 += r.abs() as f64;
+                    // Smoothed at the size of one grey level, so that a perfect pixel stays where it is.
+                    g[k] = l1_step * (r / 0.004).clamp(-1.0, 1.0) - settings.ssim_weight * g[k];
+                }
+            }
+            let (mut depth_sum, mut depth_count) = (0.0f64, 0usize);
+            for (i, (found, wanted)) in depth.iter().zip(wanted_depth).enumerate() {
+                if !(*wanted > 0.0 && *found > 0.0 && opacity[i] > 0.5) {
+                    continue;
+                }
+                let r = found - wanted;
+                if r.abs() > settings.depth_cutoff_m {
+                    continue;
+                }
+                depth_sum += r.abs() as f64;
+                depth_count += 1;
+                // Quadratic within the noise, linear beyond; far pixels count less, as they err more.
+                let sigma = target.noise.sigma_m(*wanted);
+                let weight = settings.depth_weight * reference_sigma / sigma / pixels;
+                by_depth[i] = weight * r / (r * r + sigma * sigma).sqrt();
+            }
+            (l1, depth_sum, depth_count)
+        })
+        .collect();
+    let depth_count: usize = sums.iter().map(|s| s.2).sum();
     let loss = Loss {
-        color_l1: l1 / (3.0 * pixels) as f64,
+        color_l1: sums.iter().map(|s| s.0).sum::<f64>() / (3.0 * pixels) as f64,
         ssim,
-        depth_l1_m: depth_sum / depth_count.max(1) as f64,
+        depth_l1_m: sums.iter().map(|s| s.1).sum::<f64>() / depth_count.max(1) as f64,
     };
     let opacity = Image::filled(width, height, 0.0f32);
     (loss, PixelGradients { color, depth_m: depth, opacity })
@@ -149,9 +170,12 @@ impl Adam {
     }
 
     /// One step. Surfels without any gradient (not seen) stay as they are.
-    pub fn step(&mut self, surfels: &mut SurfelCloud, gradients: &SurfelGradients, settings: &OptimiseSettings) {
-        const BETA1: f32 = 0.9;
-        const BETA2: f32 = 0.99;
+    pub fn step(
+        &mut self,
+        surfels: &mut SurfelCloud,
+        gradients: &SurfelGradients,
+        settings: &OptimiseSettings,
+    ) {
         self.resize(surfels.len());
         let rates: [f32; PARAMETERS] = std::array::from_fn(|k| match k {
             0..3 => settings.center_rate_m,
@@ -160,49 +184,107 @@ impl Adam {
             8 => settings.logit_opacity_rate,
             _ => settings.color_rate,
         });
-        for i in 0..surfels.len() {
-            let scale = surfels.scale_m[i];
-            let opacity = surfels.opacity[i];
-            let (c, r, s, k) =
-                (gradients.center_m[i], gradients.rotation[i], gradients.scale_m[i], gradients.color[i]);
-            // By the chain rule: d/d log s = s d/ds, d/d logit o = o (1 - o) d/do.
-            let by_logit = gradients.opacity[i] * opacity * (1.0 - opacity);
-            let g = [
-                c[0], c[1], c[2], r[0], r[1], r[2], s[0] * scale[0], s[1] * scale[1], by_logit, k[0], k[1], k[2],
-            ];
-            if g.iter().all(|v| *v == 0.0) || !g.iter().all(|v| v.is_finite()) {
-                continue;
-            }
-            self.steps[i] += 1;
-            let t = self.steps[i].min(10_000) as i32;
-            let (correct1, correct2) = (1.0 - BETA1.powi(t), 1.0 - BETA2.powi(t));
-            let mut change = [0.0f32; PARAMETERS];
-            for k in 0..PARAMETERS {
-                let m = BETA1 * self.first[i][k] + (1.0 - BETA1) * g[k];
-                let v = BETA2 * self.second[i][k] + (1.0 - BETA2) * g[k] * g[k];
-                (self.first[i][k], self.second[i][k]) = (m, v);
-                change[k] = -rates[k] * (m / correct1) / ((v / correct2).sqrt() + 1e-12);
-            }
-            apply(surfels, i, &change);
-        }
+        (
+            surfels.center_m.par_chunks_mut(PART),
+            surfels.rotation_wxyz.par_chunks_mut(PART),
+            surfels.scale_m.par_chunks_mut(PART),
+            surfels.opacity.par_chunks_mut(PART),
+            surfels.color.par_chunks_mut(PART),
+            self.first.par_chunks_mut(PART),
+            self.second.par_chunks_mut(PART),
+            self.steps.par_chunks_mut(PART),
+        )
+            .into_par_iter()
+            .enumerate()
+            .for_each(|(part, (center, rotation, scale, opacity, color, first, second, steps))| {
+                for i in 0..center.len() {
+                    let Some(g) = gradient(gradients, part * PART + i, scale[i], opacity[i]) else {
+                        continue;
+                    };
+                    steps[i] = steps[i].saturating_add(1);
+                    let change = moments(&mut first[i], &mut second[i], &g, steps[i], &rates);
+                    apply(
+                        Surfel {
+                            center: &mut center[i],
+                            rotation_wxyz: &mut rotation[i],
+                            scale: &mut scale[i],
+                            opacity: &mut opacity[i],
+                            color: &mut color[i],
+                        },
+                        &change,
+                    );
+                }
+            });
     }
 }
 
-fn apply(surfels: &mut SurfelCloud, i: usize, change: &[f32; PARAMETERS]) {
-    for k in 0..3 {
-        surfels.center_m[i][k] += change[k];
-        surfels.color[i][k] = (surfels.color[i][k] + change[9 + k]).clamp(0.0, 1.0);
+/// By the parameters as Adam sees them; `None` without any, or where it is not finite.
+fn gradient(
+    gradients: &SurfelGradients,
+    index: usize,
+    scale: [f32; 2],
+    opacity: f32,
+) -> Option<[f32; PARAMETERS]> {
+    let (c, r) = (gradients.center_m[index], gradients.rotation[index]);
+    let (s, k) = (gradients.scale_m[index], gradients.color[index]);
+    // By the chain rule: d/d log s = s d/ds, d/d logit o = o (1 - o) d/do.
+    let by_logit = gradients.opacity[index] * opacity * (1.0 - opacity);
+    let g =
+        [c[0], c[1], c[2], r[0], r[1], r[2], s[0] * scale[0], s[1] * scale[1], by_logit, k[0], k[1], k[2]];
+    (g.iter().any(|v| *v != 0.0) && g.iter().all(|v| v.is_finite())).then_some(g)
+}
+
+/// Decay of the first moment.
+const BETA1: f32 = 0.9;
+/// Decay of the second moment.
+const BETA2: f32 = 0.99;
+
+/// `1 - beta^t`, by `t`: how much of a moment that began at zero is there. Later it is all there.
+static CORRECTIONS: LazyLock<Vec<[f32; 2]>> =
+    LazyLock::new(|| (0..10_001).map(|t| [1.0 - BETA1.powi(t), 1.0 - BETA2.powi(t)]).collect());
+
+/// Moves the moments and returns by how much the parameters change.
+fn moments(
+    first: &mut [f32; PARAMETERS],
+    second: &mut [f32; PARAMETERS],
+    g: &[f32; PARAMETERS],
+    step: u32,
+    rates: &[f32; PARAMETERS],
+) -> [f32; PARAMETERS] {
+    let [correct1, correct2] = CORRECTIONS[step.min(10_000) as usize];
+    let mut change = [0.0f32; PARAMETERS];
+    for k in 0..PARAMETERS {
+        first[k] = BETA1 * first[k] + (1.0 - BETA1) * g[k];
+        second[k] = BETA2 * second[k] + (1.0 - BETA2) * g[k] * g[k];
+        change[k] = -rates[k] * (first[k] / correct1) / ((second[k] / correct2).sqrt() + 1e-12);
     }
-    let [w, x, y, z] = surfels.rotation_wxyz[i];
+    change
+}
+
+/// One surfel of a cloud.
+struct Surfel<'a> {
+    center: &'a mut [f32; 3],
+    rotation_wxyz: &'a mut [f32; 4],
+    scale: &'a mut [f32; 2],
+    opacity: &'a mut f32,
+    color: &'a mut [f32; 3],
+}
+
+fn apply(surfel: Surfel<'_>, change: &[f32; PARAMETERS]) {
+    for k in 0..3 {
+        surfel.center[k] += change[k];
+        surfel.color[k] = (surfel.color[k] + change[9 + k]).clamp(0.0, 1.0);
+    }
+    let [w, x, y, z] = *surfel.rotation_wxyz;
     let turned = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z))
         * UnitQuaternion::from_scaled_axis(Vector3::new(change[3], change[4], change[5]));
-    surfels.rotation_wxyz[i] = [turned.w, turned.i, turned.j, turned.k];
+    *surfel.rotation_wxyz = [turned.w, turned.i, turned.j, turned.k];
     for k in 0..2 {
-        surfels.scale_m[i][k] = (surfels.scale_m[i][k] * change[6 + k].exp()).clamp(1e-4, 0.5);
+        surfel.scale[k] = (surfel.scale[k] * change[6 + k].exp()).clamp(1e-4, 0.5);
     }
-    let o = surfels.opacity[i].clamp(1e-4, 0.9999);
+    let o = surfel.opacity.clamp(1e-4, 0.9999);
     let logit = (o / (1.0 - o)).ln() + change[8];
-    surfels.opacity[i] = (1.0 / (1.0 + (-logit).exp())).clamp(1e-4, 0.9999);
+    *surfel.opacity = (1.0 / (1.0 + (-logit).exp())).clamp(1e-4, 0.9999);
 }
 
 /// One optimiser step on one keyframe.
@@ -215,7 +297,8 @@ pub fn optimise_once(
 ) -> (Loss, u64) {
     let camera_from_submap = target.submap_from_camera.inverse();
     let views = [SubmapView { surfels, camera_from_submap }];
-    let rendering = coma_raster::render(&views, &target.camera, render_settings, None);
+    let rendering =
+        coma_raster::render_only(&views, &target.camera, render_settings, None, Outputs::OPTIMISING);
     let (loss, pixels) = loss(&rendering, target, settings);
     let gradients = coma_raster::backward(&views, &target.camera, render_settings, &rendering, &pixels);
     let hits = rendering.hits;

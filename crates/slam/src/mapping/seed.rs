@@ -118,7 +118,8 @@ mod tests {
 
     #[test]
     fn scales_follow_equation_6() {
-        let settings = SeedSettings { spacing_px: 1, scale_in_spacings: 1.0, max_stretch: 1.0, ..Default::default() };
+        let settings =
+            SeedSettings { spacing_px: 1, scale_in_spacings: 1.0, max_stretch: 1.0, ..Default::default() };
         let surfels = seed(&wall(), &Pose::identity(), &settings, |x, y| (x, y) == (15, 11), |_, _| [0.0; 3]);
         assert!((surfels[0].scale_m[0] - 2.0 / 30.0).abs() < 1e-6);
     }

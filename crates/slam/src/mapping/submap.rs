@@ -220,9 +220,8 @@ impl ActiveSubmap {
 
 /// Colour at the session's brightness, 0..1.
 pub fn corrected_color(color: &Image<[u8; 3]>, brightness: Brightness) -> Image<[f32; 3]> {
-    let table: [f32; 256] = std::array::from_fn(|v| {
-        (brightness.gain as f32 * v as f32 / 255.0).clamp(0.0, 1.0)
-    });
+    let table: [f32; 256] =
+        std::array::from_fn(|v| (brightness.gain as f32 * v as f32 / 255.0).clamp(0.0, 1.0));
     color.map(|c| c.map(|v| table[v as usize]))
 }
 

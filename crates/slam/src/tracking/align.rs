@@ -267,7 +267,14 @@ impl Problem<'_> {
     }
 
     /// Finds the partners of a row's pixels.
-    fn match_row(&self, y: usize, pose: &Pose, brightness: Brightness, matches: &mut Matches, out: &mut System) {
+    fn match_row(
+        &self,
+        y: usize,
+        pose: &Pose,
+        brightness: Brightness,
+        matches: &mut Matches,
+        out: &mut System,
+    ) {
         let camera = &self.view.camera;
         let (inv_fx, inv_fy) = (1.0 / camera.fx as f32, 1.0 / camera.fy as f32);
         let (cx, cy) = (camera.cx as f32, camera.cy as f32);

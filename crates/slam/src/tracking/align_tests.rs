@@ -78,8 +78,7 @@ fn without_photometric_weight_geometry_alone_recovers_the_corner() {
         AlignSettings { photometric_weight: 0.0, steps: vec![15], max_distance_m: 0.1, ..Default::default() };
     let reference = corner(&Pose::identity(), 1.0, 0.0);
     let found =
-        align(&reference, &corner(&motion(), 1.0, 0.0), &nearby, Brightness::default(), &settings)
-            .unwrap();
+        align(&reference, &corner(&motion(), 1.0, 0.0), &nearby, Brightness::default(), &settings).unwrap();
     let (metres, radians) = se3::distance(&found.reference_from_camera, &motion());
     assert!(metres < 1e-3, "{metres} m, {radians} rad");
 }
@@ -109,7 +108,8 @@ fn a_picture_without_depth_is_no_alignment() {
         3,
     );
     let reference = corner(&Pose::identity(), 1.0, 0.0);
-    let found = align(&reference, &empty, &Pose::identity(), Brightness::default(), &AlignSettings::default());
+    let found =
+        align(&reference, &empty, &Pose::identity(), Brightness::default(), &AlignSettings::default());
     assert!(found.is_none());
 }
 

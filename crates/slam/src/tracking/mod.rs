@@ -143,7 +143,8 @@ pub fn frame_to_frame(
     match with_velocity {
         Some(found) if found.inlier_share() > settings.map_at_once_share => Some(found),
         first => {
-            let from_rest = align(previous, view, &Pose::identity(), Brightness::default(), &settings.frame_to_frame);
+            let from_rest =
+                align(previous, view, &Pose::identity(), Brightness::default(), &settings.frame_to_frame);
             [first, from_rest].into_iter().flatten().max_by(|a, b| a.inliers.cmp(&b.inliers))
         }
     }
@@ -164,7 +165,8 @@ pub fn frame_to_model(
     for _ in 0..settings.model_rounds.max(1) {
         let picture = model.picture(&pose, &view.levels[0].camera, view, settings);
         hits += picture.hits;
-        let Some(found) = align(&picture.view, view, &Pose::identity(), brightness, &settings.frame_to_model) else {
+        let Some(found) = align(&picture.view, view, &Pose::identity(), brightness, &settings.frame_to_model)
+        else {
             return Err(vec![Reason::NotAligned { with: "the map" }]);
         };
         pose *= found.reference_from_camera;

@@ -122,7 +122,10 @@ fn sum_lanes(m: &Matches, count: usize, weights: &Weights) -> RowSums {
         }
         add(&j, &difference, &weight, &mut hessian, &mut gradient);
     }
-    RowSums { hessian: hessian.map(|lanes| lanes.iter().sum()), gradient: gradient.map(|lanes| lanes.iter().sum()) }
+    RowSums {
+        hessian: hessian.map(|lanes| lanes.iter().sum()),
+        gradient: gradient.map(|lanes| lanes.iter().sum()),
+    }
 }
 
 #[inline(always)]
@@ -166,12 +169,18 @@ mod tests {
             for i in 0..count {
                 let v = |k| value(k, i) as f64;
                 let moment = |a: usize| {
-                    [v(1) * v(a + 2) - v(2) * v(a + 1), v(2) * v(a) - v(0) * v(a + 2), v(0) * v(a + 1) - v(1) * v(a)]
+                    [
+                        v(1) * v(a + 2) - v(2) * v(a + 1),
+                        v(2) * v(a) - v(0) * v(a + 2),
+                        v(0) * v(a + 1) - v(1) * v(a),
+                    ]
                 };
                 for (first, scale, r, inv, unit) in [(3, v(6), v(7), 1.5, 1.0), (8, 1.0, v(11), 4.0, 0.25)] {
                     let torque = moment(first);
-                    let j: Vec<f64> =
-                        (0..3).map(|k| v(first + k) * scale).chain(torque.iter().map(|t| t * scale)).collect();
+                    let j: Vec<f64> = (0..3)
+                        .map(|k| v(first + k) * scale)
+                        .chain(torque.iter().map(|t| t * scale))
+                        .collect();
                     let scaled = r.abs() * inv;
                     let weight = if scaled <= 1.345 { 1.0 } else { 1.345 / scaled } * inv * inv * unit;
                     let mut k = 0;

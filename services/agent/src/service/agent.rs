@@ -33,7 +33,9 @@ impl Agent for AgentService {
         let policy = match v1::QueuePolicy::try_from(request.policy) {
             Ok(v1::QueuePolicy::Unspecified) => v1::QueuePolicy::Block,
             Ok(policy) => policy,
-            Err(_) => return Err(invalid(FieldError::new("policy", format!("{} is unknown", request.policy)))),
+            Err(_) => {
+                return Err(invalid(FieldError::new("policy", format!("{} is unknown", request.policy))));
+            }
         };
         if v1::ClockDomain::try_from(request.clock_domain).is_err() {
             let message = format!("{} is unknown", request.clock_domain);
@@ -121,7 +123,8 @@ impl Agent for AgentService {
         request: Request<v1::CloseSessionRequest>,
     ) -> Result<Response<v1::CloseSessionResponse>, Status> {
         let node = &self.0;
-        let id = coma_wire::session_id(&request.get_ref().session_id, &At::Root("session_id")).map_err(invalid)?;
+        let id =
+            coma_wire::session_id(&request.get_ref().session_id, &At::Root("session_id")).map_err(invalid)?;
         let known = node.session().as_ref().is_some_and(|s| s.id == id);
         if known {
             let (reply, finished) = oneshot::channel();
@@ -176,7 +179,10 @@ impl Agent for AgentService {
         }))
     }
 
-    async fn drain(&self, _request: Request<v1::DrainRequest>) -> Result<Response<v1::DrainResponse>, Status> {
+    async fn drain(
+        &self,
+        _request: Request<v1::DrainRequest>,
+    ) -> Result<Response<v1::DrainResponse>, Status> {
         let node = &self.0;
         let pending_frames = node.queue.pending() as u32;
         let knowledge = node.lock();
@@ -190,7 +196,10 @@ impl Agent for AgentService {
             }
         };
         wait(pending_frames > 0, format!("{pending_frames} frames to be tracked and mapped"));
-        wait(knowledge.closer.unqueried() > 0, format!("{} places to be looked up", knowledge.closer.unqueried()));
+        wait(
+            knowledge.closer.unqueried() > 0,
+            format!("{} places to be looked up", knowledge.closer.unqueried()),
+        );
         wait(pending_candidates > 0, format!("{pending_candidates} candidates to be verified"));
         wait(knowledge.closer.graph_changed(), "the graph to be solved".into());
         wait(unfinished > 0, format!("{unfinished} pieces of work under way"));

@@ -38,9 +38,7 @@ impl Peer for PeerService {
         }
         coma_geometry::AgentId::from_wire(hello.agent_id.clone(), &At::Root("agent_id")).map_err(invalid)?;
         if let Some(connection) = connection {
-            connection
-                .check_name(&hello.agent_id)
-                .map_err(|e| Status::permission_denied(e.to_string()))?;
+            connection.check_name(&hello.agent_id).map_err(|e| Status::permission_denied(e.to_string()))?;
             connection.set_class(Class::Peer);
         }
         node.found_peer(&hello.endpoint);
@@ -71,9 +69,8 @@ impl Peer for PeerService {
         };
         let knowledge = self.0.lock();
         let entries = knowledge.replica.missing(&have, limit);
-        let mut messages: Vec<Result<v1::PullEntriesResponse, Status>> = entries
-            .map(|e| Ok(v1::PullEntriesResponse { entry: Some(e.to_wire()), heads: None }))
-            .collect();
+        let mut messages: Vec<Result<v1::PullEntriesResponse, Status>> =
+            entries.map(|e| Ok(v1::PullEntriesResponse { entry: Some(e.to_wire()), heads: None })).collect();
         let heads = Some(knowledge.replica.heads().to_wire());
         messages.push(Ok(v1::PullEntriesResponse { entry: None, heads }));
         Ok(Response::new(Box::pin(stream::iter(messages))))

@@ -47,7 +47,8 @@ impl Viewer for ViewerService {
         _request: Request<v1::ListSubmapsRequest>,
     ) -> Result<Response<v1::ListSubmapsResponse>, Status> {
         let knowledge = self.0.lock();
-        let submaps = knowledge.submaps.keys().filter_map(|id| convert::submap_info(&knowledge, id)).collect();
+        let submaps =
+            knowledge.submaps.keys().filter_map(|id| convert::submap_info(&knowledge, id)).collect();
         Ok(Response::new(v1::ListSubmapsResponse { submaps }))
     }
 
@@ -78,7 +79,10 @@ impl Viewer for ViewerService {
         let packed = bytes::Bytes::from(packed);
         let messages = (0..packed.len().max(1))
             .step_by(CHUNK)
-            .map(|from| v1::GetSubmapResponse { revision, chunk: packed.slice(from..(from + CHUNK).min(packed.len())) })
+            .map(|from| v1::GetSubmapResponse {
+                revision,
+                chunk: packed.slice(from..(from + CHUNK).min(packed.len())),
+            })
             .collect();
         Ok(Response::new(answers(messages)))
     }
@@ -106,7 +110,10 @@ impl Viewer for ViewerService {
 
     type WatchStream = Answers<v1::WatchResponse>;
 
-    async fn watch(&self, _request: Request<v1::WatchRequest>) -> Result<Response<Self::WatchStream>, Status> {
+    async fn watch(
+        &self,
+        _request: Request<v1::WatchRequest>,
+    ) -> Result<Response<Self::WatchStream>, Status> {
         let events = BroadcastStream::new(self.0.watch());
         // A watcher that was too slow lost events: it gets states again, as the contract says.
         let messages = events.map(|event| match event {

@@ -2,6 +2,7 @@
 
 use crate::node::Node;
 use coma_geometry::AgentId;
+use coma_runtime::Channel;
 use coma_runtime::{Class, channel};
 use coma_slam::log::{Entry, Evidence};
 use coma_wire::v1::peer_client::PeerClient;
@@ -9,7 +10,6 @@ use coma_wire::{At, FieldError, Limited, PROTOCOL_MAJOR, PROTOCOL_MINOR, Wire, v
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
-use coma_runtime::Channel;
 use tracing::{debug, info, warn};
 
 /// What this build can do, told in Hello.
@@ -25,7 +25,12 @@ pub struct Peers {
 
 impl Peers {
     /// Fetches a blob: from its author first, then from anyone. `None` if nobody has it now.
-    pub async fn fetch_evidence(&self, node: &Node, author: &AgentId, name: &Evidence) -> Option<bytes::Bytes> {
+    pub async fn fetch_evidence(
+        &self,
+        node: &Node,
+        author: &AgentId,
+        name: &Evidence,
+    ) -> Option<bytes::Bytes> {
         let own = node.lock().agent.clone();
         let mut holders: Vec<(AgentId, PeerClient<Channel>)> = {
             let clients = self.clients.lock().unwrap_or_else(PoisonError::into_inner);
@@ -89,7 +94,11 @@ async fn session(node: &Arc<Node>, peers: &Peers, endpoint: &str, wait: &mut Dur
         anyhow::bail!("{endpoint} also calls itself {agent}: ids must be unique");
     }
     if hello.protocol_major != PROTOCOL_MAJOR {
-        anyhow::bail!("{agent} speaks protocol {}.{}, this build {PROTOCOL_MAJOR}", hello.protocol_major, hello.protocol_minor);
+        anyhow::bail!(
+            "{agent} speaks protocol {}.{}, this build {PROTOCOL_MAJOR}",
+            hello.protocol_major,
+            hello.protocol_minor
+        );
     }
     info!(%agent, endpoint, build = %hello.build, "peer greeted");
     *wait = Duration::from_millis(100);

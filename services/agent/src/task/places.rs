@@ -5,6 +5,7 @@ use crate::node::{AnchorJob, Node, Unfinished};
 use coma_frame::RgbdFrame;
 use coma_geometry::SubmapId;
 use coma_place::Descriptor;
+use coma_runtime::Channel;
 use coma_slam::log::{AnchorDescribed, Payload};
 use coma_slam::loop_closure::{Candidate, Pair};
 use coma_wire::v1::place_recognition_client::PlaceRecognitionClient;
@@ -15,7 +16,6 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 use tokio::sync::mpsc;
-use coma_runtime::Channel;
 use tracing::{debug, warn};
 
 /// How long to wait before a service that failed is asked again.
@@ -24,7 +24,7 @@ const RETRY: Duration = Duration::from_millis(500);
 type Client = PlaceRecognitionClient<Channel>;
 
 /// Describes this agent's anchors as they come.
-pub async fn describe(node: Arc<Node>, mut anchors: mpsc::UnboundedReceiver<AnchorJob>, mut client: Client) {
+pub async fn describe(node: Arc<Node>, mut anchors: mpsc::Receiver<AnchorJob>, mut client: Client) {
     while let Some(job) = anchors.recv().await {
         if let Err(e) = describe_one(&node, &mut client, &job).await {
             warn!(submap = %job.submap, error = %format!("{e:#}"), "an anchor could not be described: its place can't be recognised");
@@ -36,9 +36,10 @@ pub async fn describe(node: Arc<Node>, mut anchors: mpsc::UnboundedReceiver<Anch
 
 async fn describe_one(node: &Node, client: &mut Client, job: &AnchorJob) -> anyhow::Result<()> {
     let frame = job.frame.clone();
-    let (evidence, request) =
-        tokio::task::spawn_blocking(move || anyhow::Ok((evidence::from_frame(&frame)?, describe_request(&frame)?)))
-            .await??;
+    let (evidence, request) = tokio::task::spawn_blocking(move || {
+        anyhow::Ok((evidence::from_frame(&frame)?, describe_request(&frame)?))
+    })
+    .await??;
     {
         let mut knowledge = node.lock();
         knowledge.journal.put_evidence(&evidence.coarse.1, true)?;
@@ -187,7 +188,8 @@ pub async fn encoders(node: Arc<Node>, mut client: Client) {
         match client.get_encoders(v1::GetEncodersRequest {}).await {
             Ok(response) => {
                 let response = response.into_inner();
-                let names: Vec<String> = response.encoders.into_iter().map(|e| format!("{} ({})", e.name, e.space)).collect();
+                let names: Vec<String> =
+                    response.encoders.into_iter().map(|e| format!("{} ({})", e.name, e.space)).collect();
                 let mut knowledge = node.lock();
                 knowledge.encoder = names.join(", ");
                 knowledge.warnings.extend(response.warnings);

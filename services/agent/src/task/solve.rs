@@ -2,12 +2,12 @@
 
 use crate::convert;
 use crate::node::{Node, Unfinished};
+use coma_runtime::Channel;
 use coma_slam::log::{Payload, SolveDigest, VersionVector};
 use coma_wire::v1::dpgo_client::DpgoClient;
 use coma_wire::{At, Wire, v1};
 use std::sync::Arc;
 use std::time::Duration;
-use coma_runtime::Channel;
 use tracing::{debug, info, warn};
 
 /// Changes that come together are solved together.

@@ -38,11 +38,15 @@ pub async fn run(node: Arc<Node>, peers: Arc<Peers>) {
             Err(e) => {
                 warn!(from = %candidate.pair.from, to = %candidate.pair.to, error = %format!("{e:#}"), "evidence can't be used");
                 let message = format!("evidence can't be used: {e:#}");
-                decide(&node, &candidate, LoopOutcome::Rejected {
-                    reason: "invalid_evidence".into(),
-                    message,
-                    numbers: BTreeMap::new(),
-                });
+                decide(
+                    &node,
+                    &candidate,
+                    LoopOutcome::Rejected {
+                        reason: "invalid_evidence".into(),
+                        message,
+                        numbers: BTreeMap::new(),
+                    },
+                );
                 continue;
             }
         };

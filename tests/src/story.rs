@@ -4,7 +4,7 @@ use coma_agent::AgentConfig;
 use coma_dataset::world::{World, WorldSettings};
 use coma_dataset::{ColorBytes, DepthBytes, Sequence};
 use coma_dpgo::DpgoConfig;
-use coma_geometry::{AgentId, Pose};
+use coma_geometry::{AgentId, Intrinsics, Pose, StampNs};
 use coma_place_recognition::PlaceRecognitionConfig;
 use coma_runtime::{ByteLedger, Channel, Class, channel};
 use coma_wire::v1::agent_client::AgentClient;
@@ -31,15 +31,36 @@ pub fn truth(frame: usize) -> Pose {
     WORLD.sequence(0).expect("a walk").truth(frame).expect("the world knows")
 }
 
+/// What it sees there: RGB, row by row.
+pub fn picture(frame: usize) -> Vec<u8> {
+    match WORLD.sequence(0).expect("a walk").frame(frame).expect("a frame").color {
+        ColorBytes::Rgb8(image) => image.into_pixels().into_flattened(),
+        _ => unreachable!("the built-in world films in RGB"),
+    }
+}
+
+/// The camera itself.
+pub fn camera() -> Intrinsics {
+    WORLD.sequence(0).expect("a walk").calibration().color
+}
+
 /// A stretch of the built-in world's first walk.
 #[derive(Clone, Copy)]
 pub struct Walk {
+    /// Where it begins.
     pub first_frame: usize,
+    /// How long it is.
     pub frames: usize,
 }
 
 impl Walk {
-    fn calibration(&self) -> Calibration {
+    /// The stamp of its `index`-th frame.
+    pub fn stamp(&self, index: usize) -> StampNs {
+        WORLD.sequence(0).expect("a walk").stamp(self.first_frame + index)
+    }
+
+    /// What a session is told of the camera.
+    pub fn calibration(&self) -> Calibration {
         let sequence = WORLD.sequence(0).expect("a walk");
         let known = sequence.calibration();
         let mut calibration = Calibration::registered(known.color, known.depth_units_per_metre);
@@ -47,7 +68,8 @@ impl Walk {
         calibration
     }
 
-    fn message(&self, index: usize) -> v1::Frame {
+    /// A frame as it is streamed.
+    pub fn message(&self, index: usize) -> v1::Frame {
         let sequence = WORLD.sequence(0).expect("a walk");
         let frame = sequence.frame(self.first_frame + index).expect("a frame");
         let color = match frame.color {
@@ -77,7 +99,13 @@ pub struct Cast {
 }
 
 impl Cast {
+    /// One agent for each name; each knows those before it.
     pub async fn start(names: &[&str]) -> Cast {
+        Self::start_with_peers(names, &[]).await
+    }
+
+    /// The same, and all of them know these peers too.
+    pub async fn start_with_peers(names: &[&str], peers: &[String]) -> Cast {
         let place_recognition = coma_place_recognition::Server::start(Default::default()).await.unwrap();
         let dpgo = coma_dpgo::Server::start(Default::default()).await.unwrap();
         let data = tempfile::tempdir().unwrap();
@@ -89,7 +117,7 @@ impl Cast {
                 place_recognition: Some(place_recognition.url.clone()),
                 dpgo: Some(dpgo.url.clone()),
                 // Each greets those before it, and is followed back.
-                peers: agents.iter().map(|a| a.url.clone()).collect(),
+                peers: agents.iter().map(|a| a.url.clone()).chain(peers.iter().cloned()).collect(),
                 gossip: false,
                 ..AgentConfig::default()
             };
@@ -138,12 +166,23 @@ impl Cast {
         self.viewer(index).list_submaps(v1::ListSubmapsRequest {}).await.unwrap().into_inner().submaps
     }
 
-    fn agent(&self, index: usize) -> AgentClient<Channel> {
+    /// Where an agent serves.
+    pub fn url(&self, index: usize) -> String {
+        self.agents[index].url.clone()
+    }
+
+    /// Calls to an agent, as its clients make them.
+    pub fn agent(&self, index: usize) -> AgentClient<Channel> {
         AgentClient::new(self.channels[index].clone()).limited(MAX_MESSAGE_BYTES)
     }
 
     fn viewer(&self, index: usize) -> ViewerClient<Channel> {
         ViewerClient::new(self.channels[index].clone()).limited(MAX_MESSAGE_BYTES)
+    }
+
+    /// Where the agents serve.
+    pub fn urls(&self) -> Vec<String> {
+        self.agents.iter().map(|agent| agent.url.clone()).collect()
     }
 
     /// Every agent gets its walk, at the same time; returns when all frames are processed.
@@ -178,8 +217,20 @@ impl Cast {
         }
     }
 
+    /// The graph as an agent sees it.
     pub async fn graph(&self, index: usize) -> v1::GetGraphResponse {
         self.viewer(index).get_graph(v1::GetGraphRequest {}).await.unwrap().into_inner()
+    }
+
+    /// How many frames have a pose.
+    pub async fn poses(&self, index: usize) -> usize {
+        let request = v1::GetTrajectoryRequest { first_sequence: 0 };
+        let mut answers = self.viewer(index).get_trajectory(request).await.unwrap().into_inner();
+        let mut count = 0;
+        while let Some(answer) = answers.message().await.unwrap() {
+            count += answer.poses.len();
+        }
+        count
     }
 
     /// The trajectory in the map, frame by frame; frames without a pose in the map are left out.
@@ -194,6 +245,7 @@ impl Cast {
         poses
     }
 
+    /// Ends all in order.
     pub async fn shutdown(self) {
         for agent in self.agents {
             agent.shutdown().await;

@@ -1,9 +1,7 @@
 //! Agents and their services in one process, over gRPC on loopback, in the built-in world.
 
-mod story;
-
 use coma_geometry::se3;
-use story::{Cast, Walk};
+use coma_tests::story::{self, Cast, Walk};
 
 /// Two agents walk the same stretch of the room, half a submap apart, and know nothing of each other's start.
 #[tokio::test(flavor = "multi_thread")]
