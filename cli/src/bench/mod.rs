@@ -11,6 +11,7 @@ pub mod places;
 pub mod registration;
 pub mod robust;
 pub mod sets;
+pub mod team;
 pub mod tracking;
 
 use clap::Subcommand;
@@ -26,6 +27,7 @@ pub enum Bench {
     Depth(depth::Arguments),
     Graph(graph::Arguments),
     Robust(robust::Arguments),
+    Team(team::Arguments),
 }
 
 /// Runs it.
@@ -38,5 +40,6 @@ pub fn run(bench: &Bench) -> anyhow::Result<()> {
         Bench::Depth(arguments) => depth::run(arguments),
         Bench::Graph(arguments) => graph::run(arguments),
         Bench::Robust(arguments) => robust::run(arguments),
+        Bench::Team(arguments) => team::run(arguments),
     }
 }

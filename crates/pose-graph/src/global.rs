@@ -1,7 +1,7 @@
 //! Global phase (eq. 10): the canonical solve of a cut.
 
 use crate::chain::{Chain, Trunk, chains, extend_by_composition};
-use crate::consistency::Bridge;
+use crate::consistency::{Bridge, lonely};
 use crate::gnc::{self, RobustSettings, RobustSolved, Trust};
 use crate::graph::{DEFAULT_ANCHOR_PRIORITY, Edge, EdgeKey, GraphEntries, NodeInfo, UsableGraph};
 use crate::relative::{JoinSettings, Joined, NotJoined, join};
@@ -93,10 +93,13 @@ fn lay_out(
     let paired: BTreeSet<usize> = pairs.keys().flat_map(|(s, t)| [*s, *t]).collect();
     let lay_out_one = |(index, chain): (usize, &Chain)| {
         let mut trunk = Trunk::new(chain);
-        let own = |e: &&Edge| chain.submaps.contains(&e.from) && chain.submaps.contains(&e.to);
-        let own: Vec<&Edge> = loops.iter().filter(own).collect();
+        let own: Vec<&Edge> = loops.iter().filter(|e| chain.holds(e)).collect();
+        let limit = settings.robust.squared_error_6dof;
+        let apart: Vec<bool> = lonely(&own, &trunk, limit);
+        trunk.lonely.extend(own.iter().zip(&apart).filter(|(_, l)| **l).map(|(e, _)| e.key.clone()));
         if paired.contains(&index) && !own.is_empty() {
-            let trust = vec![Trust::Doubted; own.len()];
+            let trust: Vec<Trust> =
+                apart.iter().map(|l| if *l { Trust::Suspended } else { Trust::Doubted }).collect();
             let robust = Indexed::new(&trunk.chain_from_submap, &chain.first).solve(
                 chain.solved_odometry.iter(),
                 &own,
@@ -256,15 +259,12 @@ fn solve_component(
     let contradicting = contradicting(pairs, joins);
     // A loop that nothing supports is left out until the others say where its ends are.
     let supported = supported(pairs, joins);
-    let trust: Vec<Trust> = loops
-        .iter()
-        .map(|e| {
-            let within_a_chain = members
-                .iter()
-                .any(|&k| chains[k].submaps.contains(&e.from) && chains[k].submaps.contains(&e.to));
-            if within_a_chain || supported.contains(&e.key) { Trust::Doubted } else { Trust::Suspended }
-        })
-        .collect();
+    let believed = |e: &Edge| match members.iter().find(|&&k| chains[k].holds(e)) {
+        Some(&k) => !trunks[k].lonely.contains(&e.key),
+        None => supported.contains(&e.key),
+    };
+    let trust: Vec<Trust> =
+        loops.iter().map(|e| if believed(e) { Trust::Doubted } else { Trust::Suspended }).collect();
     let odometry = members.iter().flat_map(|&k| chains[k].solved_odometry.iter());
     let (submaps, outcome) = Indexed::new(&start, &gauge).solve(odometry, &loops, &trust, settings);
     let weigh = |edge: &Edge, weight: f64, poses: &BTreeMap<SubmapId, Pose>| {

@@ -113,33 +113,3 @@ fn nine_robots_survive_false_loops() {
         assert!(seeds_survived("nine-robots", (0.12, 0.10), false_loops) >= 9);
     }
 }
-
-#[test]
-#[ignore = "probe"]
-fn probe_sphere() {
-    let path = shared_data().join("pose-graphs/sphere2500.g2o");
-    let graph = G2oGraph::parse(&std::fs::read_to_string(path).unwrap()).unwrap();
-    let (clean, _) = team::entries(&[graph], Believed::Consecutive, None).unwrap();
-    let clock = std::time::Instant::now();
-    let reference = solve(&clean, &GlobalSettings::default());
-    let c = &reference.components[0];
-    println!("clean {} of {} used, cost {} iterations {} {:.1} s", c.loops.iter().filter(|l| l.weight > 0.5).count(), c.loops.len(), c.cost, c.iterations, clock.elapsed().as_secs_f64());
-    let submaps: Vec<&SubmapId> = clean.nodes.keys().collect();
-    let n = c.loops.len() / 4;
-    for seed in 0..2 {
-        let mut random = Random(seed);
-        let mut entries = clean.clone();
-        for k in 0..n {
-            let (from, to) = (submaps[random.below(2500)], submaps[random.below(2500)]);
-            if from == to { continue; }
-            let key = EdgeKey { agent: from.agent.clone(), epoch: Epoch(0), sequence: 50_000 + k as u64 };
-            entries.edges.push(Edge { key, kind: EdgeKind::Loop, from: from.clone(), to: to.clone(), from_from_to: random.any_pose(50.0), information: clean.edges[0].information });
-        }
-        let clock = std::time::Instant::now();
-        let s = solve(&entries, &GlobalSettings::default());
-        let d = &s.components[0];
-        println!("{} components, rms {} false used {} true used {} iterations {} {:.1} s", s.components.len(), rms_m(c, d),
-            d.loops.iter().filter(|l| l.key.sequence >= 50_000 && l.weight > 0.5).count(),
-            d.loops.iter().filter(|l| l.key.sequence < 50_000 && l.weight > 0.5).count(), d.iterations, clock.elapsed().as_secs_f64());
-    }
-}

@@ -41,6 +41,11 @@ impl Default for BlockSettings {
     }
 }
 
+/// Momentum that was too much is cut to this share,
+const KEPT: f64 = 0.7;
+/// and is slowly regained, by this factor in each step: what was too much while nodes found their places is not later.
+const REGAINED: f64 = 1.005;
+
 /// What an agent knows of a neighbour.
 #[derive(Clone, Debug, Default)]
 struct Neighbour {
@@ -275,13 +280,14 @@ impl BlockAgent {
         self.usual_step = if self.usual_step > 0.0 { 0.8 * self.usual_step + 0.2 * length } else { length };
         self.least_step = self.least_step.min(self.usual_step);
         // Swinging around the minimum is what momentum does; swinging farther and farther is too much of it, as stale
-        // news makes it. In the end this is plain descent.
+        // news makes it.
         if self.usual_step > 3.0 * self.least_step {
-            self.most_momentum *= 0.7;
+            self.most_momentum *= KEPT;
             self.momentum = 0.0;
             self.moved.clear();
             self.least_step = self.usual_step;
         }
+        self.most_momentum = (self.most_momentum * REGAINED).min(self.settings.most_momentum);
         self.momentum = (self.momentum + 0.1).min(self.most_momentum);
         (self.farthest_m, self.farthest_rad) = (0.0, 0.0);
         for (node, step) in steps {
