@@ -139,7 +139,7 @@ fn table(rows: &[Row]) -> String {
         let excess = r.excess.map_or("not placed".to_owned(), |e| format!("{:.3} %", e * 100.0));
         let _ = writeln!(
             out,
-            "| {} | {} | {} | {:.6} | {excess} | {} | {} | {} | {:.1} | {:.1} | {} |",
+            "| {} | {} | {} | {:.6} | {excess} | {} | {} | {} | {:.1} | {:.1} | {:.0} |",
             r.set,
             r.blocks,
             r.loss,

@@ -6,11 +6,12 @@ use crate::synth::graph::{Team, graph};
 use anyhow::{Context, anyhow, ensure};
 use clap::Args;
 use coma_evaluation::{Growth, Line, growth_svg};
-use coma_geometry::Pose;
+use coma_geometry::{Pose, SubmapId};
 use coma_pose_graph::blocks::cut::blocks_of;
 use coma_pose_graph::blocks::{BlockSettings, Simulation};
 use coma_pose_graph::team::{self, Believed};
-use coma_pose_graph::{GlobalSettings, LoopWeight, solve};
+use coma_pose_graph::g2o::G2oGraph;
+use coma_pose_graph::{Component, GlobalSettings, LoopWeight, solve};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -81,59 +82,64 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 fn row(team: &Team, arguments: &Arguments) -> anyhow::Result<Row> {
     let graph = graph(team)?;
-    let (entries, _) = team::entries(std::slice::from_ref(&graph), Believed::Consecutive, None)?;
+    let (entries, vertices) = team::entries(std::slice::from_ref(&graph), Believed::Consecutive, None)?;
     let (solution, central) = timed(|| solve(&entries, &GlobalSettings::default()));
     ensure!(solution.components.len() == 1, "the team's graph fell into {} maps", solution.components.len());
     let component = &solution.components[0];
-    let used = |l: &&LoopWeight| l.weight > 0.5;
-    let blocks = if arguments.central_only {
-        None
-    } else {
-        let (problem, _) = graph.problem();
-        // The weights that the central solve has found, by the ends of the measurement.
-        let weight: BTreeMap<_, f64> = component.loops.iter().map(|l| ((&l.from, &l.to), l.weight)).collect();
-        let submaps: Vec<_> = entries.nodes.keys().collect();
-        let weights: Vec<f64> = problem
-            .constraints
-            .iter()
-            .map(|c| weight.get(&(submaps[c.from], submaps[c.to])).copied().unwrap_or(1.0))
-            .collect();
-        let of: Vec<u32> = (0..problem.nodes).map(|node| (node / team.submaps) as u32).collect();
-        let cut = blocks_of(&problem, &weights, &vec![false; weights.len()], &of);
-        let poses: Vec<Pose> = component.map_from_submap.values().copied().collect();
-        let goal = problem.cost(&poses, &weights);
-        let begin = |node: u32| poses[node as usize];
-        let mut simulation =
-            Simulation::new(cut, begin, BlockSettings::default(), arguments.network.network());
-        let mut excess = None;
-        let (outcome, spent) = timed(|| {
-            while simulation.rounds() < arguments.network.rounds
-                && !simulation.is_settled()
-                && !excess.is_some_and(|e: f64| e <= 1e-3)
-            {
-                simulation.round()?;
-                let placed: Option<Vec<Pose>> = simulation.poses(problem.nodes).into_iter().collect();
-                excess = placed.map(|poses| problem.cost(&poses, &weights) / goal - 1.0);
-            }
-            anyhow::Ok(())
-        });
-        outcome?;
-        Some(Blocks {
-            rounds: simulation.rounds(),
-            excess,
-            bytes_per_agent: simulation.traffic.bytes / team.agents as u64,
-            cpu_ms_per_agent: spent.cpu_ms / team.agents as f64,
-        })
+    let blocks = match arguments.central_only {
+        true => None,
+        false => Some(by_blocks(&graph, component, &vertices, team, &arguments.network)?),
     };
     Ok(Row {
         agents: team.agents,
         submaps: entries.nodes.len(),
         loops: component.loops.len(),
-        loops_used: component.loops.iter().filter(used).count(),
+        loops_used: component.loops.iter().filter(|l| l.weight > 0.5).count(),
         central,
         central_steps: component.iterations,
         cost: component.cost,
         blocks,
+    })
+}
+
+/// The same graph with the weights that the central solve has found, each agent its own block.
+fn by_blocks(
+    graph: &G2oGraph,
+    component: &Component,
+    vertices: &BTreeMap<SubmapId, u64>,
+    team: &Team,
+    network: &NetworkArguments,
+) -> anyhow::Result<Blocks> {
+    let (problem, _) = graph.problem();
+    let ends = |l: &LoopWeight| (vertices[&l.from], vertices[&l.to]);
+    let weight: BTreeMap<(u64, u64), f64> = component.loops.iter().map(|l| (ends(l), l.weight)).collect();
+    let weights: Vec<f64> =
+        graph.edges.iter().map(|e| weight.get(&(e.from, e.to)).copied().unwrap_or(1.0)).collect();
+    let central: BTreeMap<u64, Pose> =
+        component.map_from_submap.iter().map(|(submap, pose)| (vertices[submap], *pose)).collect();
+    let central: Vec<Pose> = central.into_values().collect();
+    let goal = problem.cost(&central, &weights);
+    let of: Vec<u32> = (0..problem.nodes).map(|node| (node / team.submaps) as u32).collect();
+    let cut = blocks_of(&problem, &weights, &vec![false; weights.len()], &of);
+    let begin = |node: u32| central[node as usize];
+    let mut simulation = Simulation::new(cut, begin, BlockSettings::default(), network.network());
+    let mut excess = None;
+    let mut cpu_ms = 0.0;
+    while simulation.rounds() < network.rounds
+        && !simulation.is_settled()
+        && !excess.is_some_and(|e: f64| e <= 1e-3)
+    {
+        let (stepped, took) = timed(|| simulation.round());
+        stepped?;
+        cpu_ms += took.cpu_ms;
+        let placed: Option<Vec<Pose>> = simulation.poses(problem.nodes).into_iter().collect();
+        excess = placed.map(|poses| problem.cost(&poses, &weights) / goal - 1.0);
+    }
+    Ok(Blocks {
+        rounds: simulation.rounds(),
+        excess,
+        bytes_per_agent: simulation.traffic.bytes / team.agents as u64,
+        cpu_ms_per_agent: cpu_ms / team.agents as f64,
     })
 }
 

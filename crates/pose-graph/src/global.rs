@@ -5,11 +5,9 @@ use crate::consistency::{Bridge, lonely};
 use crate::gnc::{self, RobustSettings, RobustSolved, Trust};
 use crate::graph::{DEFAULT_ANCHOR_PRIORITY, Edge, EdgeKey, GraphEntries, NodeInfo, UsableGraph};
 use crate::relative::{JoinSettings, Joined, NotJoined, join};
-use crate::solution::{
-    Component, LoopVerdict, LoopWeight, MapId, PairJoin, PairReport, Solution, pose_digest,
-};
+use crate::solution::{Component, LoopVerdict, LoopWeight, PairJoin, PairReport, Solution, pose_digest};
 use crate::solver::{Constraint, Problem, SolveError, SolverSettings};
-use coma_geometry::{AgentId, Pose, SubmapId};
+use coma_geometry::{AgentId, MapId, Pose, SubmapId};
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};

@@ -48,5 +48,5 @@ pub mod uncertain;
 
 pub use global::{GlobalSettings, solve};
 pub use graph::{Edge, EdgeKey, EdgeKind, GraphEntries, NodeInfo};
-pub use solution::{Component, Generation, LoopVerdict, LoopWeight, MapId, Solution};
+pub use solution::{Component, Generation, LoopVerdict, LoopWeight, Solution};
 pub use solver::{Constraint, Objective, Problem, SolveError, Solved, SolverSettings};

@@ -23,7 +23,7 @@ pub use field::{At, FieldError, Wire, checked, field_errors_of, invalid, invalid
 pub use frame::{ColorData, DepthData, EncodedFrame, encode_frame, read_color, session_id};
 pub use geometry::finite;
 pub use limited::Limited;
-pub use log::{entry_from_bytes, entry_to_bytes, hash, map_id, version_vector};
+pub use log::{entry_from_bytes, entry_to_bytes, hash, version_vector};
 pub use payload::{decode_payload, encode_payload};
 
 /// The words of the log that conversions give, for services that know agents by their messages alone.
