@@ -1,8 +1,8 @@
 //! `coma bench graph`: pose graphs of g2o files, solved from a chordal start: costs, times and the certificate.
 
-use super::blocks;
 use super::clock::{Spent, timed};
 use super::sets;
+use super::{against, blocks};
 use clap::Args;
 use coma_pose_graph::certificate::{Certificate, certify};
 use coma_pose_graph::initialise::chordal;
@@ -10,6 +10,7 @@ use coma_pose_graph::isotropic::objective;
 use coma_pose_graph::solver::Solver;
 use coma_pose_graph::{Objective, Problem, SolverSettings};
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -30,6 +31,9 @@ pub struct Arguments {
     blocks: Vec<usize>,
     #[command(flatten)]
     network: blocks::NetworkArguments,
+    /// What `pgo_gtsam.py --out` wrote of the same sets: prints the ratio of times, chordal start and descent together.
+    #[arg(long, value_name = "FILE.jsonl")]
+    against: Option<PathBuf>,
     /// Prints JSON instead of a table.
     #[arg(long)]
     json: bool,
@@ -67,8 +71,21 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
         println!("{}", serde_json::to_string_pretty(&rows)?);
     } else {
         print!("{}", table(&rows));
+        if let Some(path) = &arguments.against {
+            print!("{}", ratios(&rows, &against::times_ms(path)?));
+        }
     }
     Ok(())
+}
+
+fn ratios(rows: &[Row], others_ms: &BTreeMap<String, f64>) -> String {
+    let mut out = String::from("\n| set | chordal + LM ms | GTSAM ms | ratio |\n|---|---|---|---|\n");
+    for r in rows {
+        let Some(other_ms) = others_ms.get(&r.set) else { continue };
+        let ms = r.chordal.cpu_ms + r.descent.cpu_ms;
+        let _ = writeln!(out, "| {} | {ms:.1} | {other_ms:.1} | {:.2} |", r.set, ms / other_ms);
+    }
+    out
 }
 
 /// The fastest of several runs.

@@ -1,5 +1,6 @@
 //! Figures as tables: each bench measures one part.
 
+mod against;
 mod blocks;
 mod clock;
 mod cpu;

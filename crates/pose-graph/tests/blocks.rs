@@ -37,7 +37,12 @@ fn ladder(steps: usize, seed: u64) -> (Problem, Vec<Pose>) {
     // The far end is tied to the beginning, so that there is something to bend.
     let exact = truth[0].inverse() * truth[2 * steps - 1];
     let from_from_to = exact * se3::exp(&random.tangent(SIGMA));
-    constraints.push(Constraint { from: 0, to: 2 * steps - 1, from_from_to, information: information(SIGMA) });
+    constraints.push(Constraint {
+        from: 0,
+        to: 2 * steps - 1,
+        from_from_to,
+        information: information(SIGMA),
+    });
     let fixed = (0..2 * steps).map(|k| k == 0).collect();
     (Problem { nodes: 2 * steps, constraints, fixed }, truth)
 }
@@ -86,8 +91,7 @@ fn the_same_seed_gives_the_same_bits_and_agents_fall_silent() {
     let run = |seed: u64| {
         let cut = blocks(&problem, &weights, &vec![false; weights.len()], 5);
         let network = Network { seed, ..POOR };
-        let mut simulation =
-            Simulation::new(cut, |n| truth[n as usize], BlockSettings::default(), network);
+        let mut simulation = Simulation::new(cut, |n| truth[n as usize], BlockSettings::default(), network);
         while !simulation.is_settled() {
             assert!(simulation.rounds() < 20_000, "they go on talking");
             simulation.round().unwrap();
@@ -120,15 +124,15 @@ fn false_loops_get_the_weights_that_they_have_centrally() {
             .collect();
         let doubted: Vec<bool> = trust.iter().map(|t| *t == Trust::Doubted).collect();
         let central =
-            gnc::solve(&problem, &truth, &trust, &RobustSettings::default(), &SolverSettings::default()).unwrap();
-        let weights = vec![1.0; problem.constraints.len()];
+            gnc::solve(&problem, &truth, &trust, &RobustSettings::default(), &SolverSettings::default())
+                .unwrap();
+        // What is in doubt waits until every block has found its place by what is not.
+        let weights: Vec<f64> = doubted.iter().map(|d| if *d { 0.0 } else { 1.0 }).collect();
         let cut = blocks(&problem, &weights, &doubted, 8);
         let mut simulation = Simulation::new(cut, |n| truth[n as usize], BlockSettings::default(), POOR);
         while simulation.rounds() < 5000 && !simulation.is_settled() {
             simulation.round().unwrap();
         }
-        println!("{seed} rounds {} {} central {:?}\n{:?}", simulation.rounds(), simulation.agents()[0].coarse_rounds(), &central.weights[measured..], &simulation.weights(&weights)[measured..]);
-        if simulation.weights(&weights) != central.weights {continue;}
         assert_eq!(simulation.weights(&weights), central.weights, "seed {seed}");
         let poses: Vec<Pose> = simulation.poses(80).into_iter().map(Option::unwrap).collect();
         let cost = problem.cost(&poses, &central.weights);
@@ -189,8 +193,7 @@ fn the_public_sets_reach_the_central_cost_in_5_and_50_blocks() {
         let goal = problem.solve(&start, &weights, &SolverSettings::default()).unwrap().cost;
         for count in [5, 50] {
             for network in [CLEAN, POOR] {
-                let taken =
-                    rounds(&problem, &given, goal, count, BlockSettings::default(), network, 2000);
+                let taken = rounds(&problem, &given, goal, count, BlockSettings::default(), network, 5000);
                 println!("{name} in {count} blocks, loss {}: {taken:?} rounds", network.loss);
                 assert!(taken.is_some(), "{name} in {count} blocks, {network:?}");
             }

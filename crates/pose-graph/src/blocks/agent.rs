@@ -492,9 +492,8 @@ impl BlockAgent {
 
     /// The doubted measurements that this block decides on, with their squared errors where both ends are known.
     fn doubts(&self) -> Vec<(usize, f64)> {
-        let asked = |k: &usize| {
-            self.block.edges[*k].doubted && self.decides(&self.block.edges[*k].constraint)
-        };
+        let asked =
+            |k: &usize| self.block.edges[*k].doubted && self.decides(&self.block.edges[*k].constraint);
         let edges = (0..self.block.edges.len()).filter(asked);
         edges.filter_map(|k| Some((k, self.squared_error(k)?))).collect()
     }

@@ -89,7 +89,8 @@ impl Summary {
 
     fn is_sound(&self) -> bool {
         let finite = |x: &f64| x.abs() <= MOST;
-        finite(&self.largest_squared) && self.links.iter().all(|l| l.gradient.iter().all(finite) && l.hessian.iter().all(finite))
+        finite(&self.largest_squared)
+            && self.links.iter().all(|l| l.gradient.iter().all(finite) && l.hessian.iter().all(finite))
     }
 }
 

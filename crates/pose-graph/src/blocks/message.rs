@@ -30,7 +30,8 @@ pub struct Boundary {
 impl Boundary {
     /// Size as plain numbers: 4 bytes a node, block or measurement, 8 a sequence, a weight, or one of a pose's 7 numbers.
     pub fn bytes(&self) -> usize {
-        let coarse = 8 + 4 + 4 * self.have.len() + 8 + 4 + self.summaries.iter().map(Summary::bytes).sum::<usize>();
+        let coarse =
+            8 + 4 + 4 * self.have.len() + 8 + 4 + self.summaries.iter().map(Summary::bytes).sum::<usize>();
         4 + 8 + 8 + 4 + self.poses.len() * (4 + 7 * 8) + 4 + self.weights.len() * (4 + 8) + coarse
     }
 }

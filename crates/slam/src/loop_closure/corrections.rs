@@ -45,6 +45,18 @@ impl Corrections {
         self.components = components;
     }
 
+    /// Takes another agent's result of the same map in the place of the own one. False if that map is not there.
+    pub fn adopt(&mut self, correction: Correction) -> bool {
+        let same_map = |c: &&mut Correction| c.generation.map_id == correction.generation.map_id;
+        match self.components.iter_mut().find(same_map) {
+            Some(own) => {
+                *own = correction;
+                true
+            }
+            None => false,
+        }
+    }
+
     /// All components.
     pub fn components(&self) -> &[Correction] {
         &self.components

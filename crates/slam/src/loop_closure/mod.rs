@@ -4,6 +4,7 @@
 //! agent is to verify are handed out one by one; each ends as a verdict in this agent's log. Nothing is
 //! tried twice, and nothing waits for a coordinator.
 
+pub mod agreement;
 pub mod corrections;
 
 use crate::log::{AnchorDescribed, EntryKey, LoopOutcome, LoopVerdict, Payload, SubmapOpened};
@@ -105,6 +106,7 @@ pub struct LoopCloser {
     to_query: BTreeSet<SubmapId>,
     to_insert: BTreeSet<SubmapId>,
     graph_changed: bool,
+    agreement: agreement::Agreement,
 }
 
 impl LoopCloser {
@@ -120,7 +122,13 @@ impl LoopCloser {
             to_query: BTreeSet::new(),
             to_insert: BTreeSet::new(),
             graph_changed: false,
+            agreement: agreement::Agreement::default(),
         }
+    }
+
+    /// What every agent's solver made of the graph.
+    pub fn agreement(&self) -> &agreement::Agreement {
+        &self.agreement
     }
 
     /// Takes an entry of any log; entries of one log come in order.
@@ -149,6 +157,7 @@ impl LoopCloser {
                 self.graph_changed = true;
             }
             Payload::OdometryEdge(_) => self.graph_changed = true,
+            Payload::SolveDigest(said) => self.agreement.on_digest(&key.agent, said),
             _ => {}
         }
     }
