@@ -19,8 +19,8 @@ pub fn times_ms(path: &Path) -> anyhow::Result<BTreeMap<String, f64>> {
     let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
     let mut out = BTreeMap::new();
     for (number, line) in text.lines().enumerate().filter(|(_, line)| line.starts_with('{')) {
-        let record: Record = serde_json::from_str(line)
-            .with_context(|| format!("{}: line {}", path.display(), number + 1))?;
+        let record: Record =
+            serde_json::from_str(line).with_context(|| format!("{}: line {}", path.display(), number + 1))?;
         if let (true, Some(chordal), Some(descent)) =
             (record.method == "lm", record.chordal_cpu_ms, record.cpu_ms_median)
         {

@@ -19,13 +19,6 @@ pub struct Chain {
     pub solved_odometry: Vec<Edge>,
 }
 
-impl Chain {
-    /// True if both ends of the edge are in it.
-    pub fn holds(&self, edge: &Edge) -> bool {
-        self.submaps.contains(&edge.from) && self.submaps.contains(&edge.to)
-    }
-}
-
 /// The submaps reached from `start` over `edges`.
 fn reached<'a>(start: &'a SubmapId, edges: &'a [Edge]) -> BTreeSet<&'a SubmapId> {
     let neighbours = neighbours(edges);
