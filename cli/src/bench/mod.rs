@@ -1,6 +1,7 @@
 //! Figures as tables: each bench measures one part.
 
 mod ablation;
+mod against;
 mod blocks;
 mod clock;
 mod cpu;
@@ -13,6 +14,7 @@ pub mod raster;
 pub mod registration;
 pub mod robust;
 pub mod sets;
+pub mod team;
 pub mod tracking;
 
 use clap::Subcommand;
@@ -30,6 +32,7 @@ pub enum Bench {
     Depth(depth::Arguments),
     Graph(graph::Arguments),
     Robust(robust::Arguments),
+    Team(team::Arguments),
 }
 
 /// Runs it.
@@ -44,5 +47,6 @@ pub fn run(bench: &Bench) -> anyhow::Result<()> {
         Bench::Depth(arguments) => depth::run(arguments),
         Bench::Graph(arguments) => graph::run(arguments),
         Bench::Robust(arguments) => robust::run(arguments),
+        Bench::Team(arguments) => team::run(arguments),
     }
 }

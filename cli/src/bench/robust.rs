@@ -30,7 +30,7 @@ pub struct Arguments {
     #[arg(long, value_delimiter = ',', default_value = "0.3,0.6")]
     shares: Vec<f64>,
     /// Standard deviations of every measurement, metres and radians, instead of the files' information.
-    #[arg(long, value_delimiter = ',', num_args = 2)]
+    #[arg(long, value_delimiter = ',', value_name = "M,RAD")]
     edge_sigma: Option<Vec<f64>>,
     /// Number of seeds.
     #[arg(long, default_value_t = 10)]
@@ -223,7 +223,7 @@ fn table(rows: &[Row]) -> String {
         let rms = r.rms_m.map_or("fell apart".into(), |m| format!("{:.1}", m * 1e3));
         let _ = writeln!(
             out,
-            "| {} | {} | {} | {} | {} | {rms} | {:.1} | {} | {} of {} | {} |",
+            "| {} | {} | {} | {} | {} | {rms} | {:.1} | {} | {} of {} | {:.0} |",
             r.set,
             r.share,
             r.seed,
@@ -233,7 +233,7 @@ fn table(rows: &[Row]) -> String {
             r.false_used,
             r.true_used,
             r.true_loops,
-            r.solve.text()
+            r.solve.cpu_ms
         );
     }
     for group in rows.chunk_by(|a, b| (&a.set, a.share) == (&b.set, b.share)) {

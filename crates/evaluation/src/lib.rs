@@ -4,7 +4,7 @@
 //!   component together. P, the paper's: one for each agent. No scale anywhere.
 //! * [`score_frame`] compares a rendered view with the recorded one; [`PictureScores`] is the mean over views.
 //! * [`NormalisedErrors`] says whether edges of the pose graph are as certain as they claim.
-//! * [`graph_svg`] draws a pose graph before and after a solve.
+//! * [`graph_svg`] draws a pose graph before and after a solve; [`growth_svg`] draws figures that grow.
 //! * [`bars_svg`] draws figures of several variants beside each other.
 //! * [`Report`] holds these beside settings, bytes and times: `report.json`, [`Report::to_markdown`],
 //!   [`Report::to_html`].
@@ -17,6 +17,7 @@ mod bars_picture;
 mod curve;
 mod edges;
 mod graph_picture;
+mod growth;
 mod pictures;
 mod report;
 mod ssim;
@@ -28,6 +29,7 @@ pub use bars_picture::{BarPanel, bars_svg};
 pub use curve::{Curve, CurvePoint};
 pub use edges::{Edge, NormalisedErrors};
 pub use graph_picture::{GraphPicture, graph_svg};
+pub use growth::{Growth, Line, growth_svg};
 pub use pictures::{
     DepthL1, EQUAL_PICTURES_DB, FrameScore, PictureError, PictureScores, View, depth_l1, psnr_db,
     psnr_where_db, score_frame,

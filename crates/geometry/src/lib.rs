@@ -17,7 +17,7 @@ pub mod time;
 pub mod tum;
 
 pub use camera::{Distortion, Intrinsics, IntrinsicsError};
-pub use id::{AgentId, Epoch, InvalidAgentId, KeyframeId, SubmapId};
+pub use id::{AgentId, Epoch, InvalidAgentId, InvalidMapId, KeyframeId, MapId, SubmapId};
 pub use nalgebra;
 pub use time::StampNs;
 

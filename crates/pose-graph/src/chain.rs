@@ -1,7 +1,7 @@
 //! Chains: the longest stretches of submaps that odometry connects. An agent that never lost its tracking has
 //! one. Chains are what loops join into components.
 
-use crate::graph::{Cut, Edge, UsableGraph, within};
+use crate::graph::{Cut, Edge, EdgeKey, UsableGraph, within};
 use crate::uncertain::UncertainPose;
 use coma_geometry::{Matrix6, Pose, SubmapId, se3};
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
@@ -132,14 +132,18 @@ pub fn extend_by_composition(placed: &mut BTreeMap<SubmapId, Pose>, odometry: &[
 pub struct Trunk {
     /// `chain_from_submap`; the chain's frame is that of its first submap.
     pub chain_from_submap: BTreeMap<SubmapId, Pose>,
-    /// Per submap: its predecessor on the way from the first one, the number of steps, and the summed covariance of
-    /// these steps, in the chain's frame.
-    along: BTreeMap<SubmapId, Along>,
+    /// Loops within it that none of the others supports, although most have support.
+    pub lonely: BTreeSet<EdgeKey>,
+    /// Where each submap stands in `along`.
+    index: BTreeMap<SubmapId, usize>,
+    along: Vec<Along>,
 }
 
+/// A submap's predecessor on the way from the first one, the number of steps, and the summed covariance of these steps,
+/// in the chain's frame.
 #[derive(Clone, Debug)]
 struct Along {
-    parent: Option<SubmapId>,
+    parent: usize,
     depth: usize,
     covariance: Matrix6,
 }
@@ -147,17 +151,17 @@ struct Along {
 impl Trunk {
     /// Lays a chain out by its odometry (what is solved for of it).
     pub fn new(chain: &Chain) -> Self {
-        let root = Along { parent: None, depth: 0, covariance: Matrix6::zeros() };
-        let mut along = BTreeMap::from([(chain.first.clone(), root)]);
+        let mut along = vec![Along { parent: 0, depth: 0, covariance: Matrix6::zeros() }];
+        let mut index = BTreeMap::from([(chain.first.clone(), 0)]);
         let mut chain_from_submap = BTreeMap::from([(chain.first.clone(), Pose::identity())]);
         let adjacent = neighbours(&chain.solved_odometry);
         let mut open = VecDeque::from([chain.first.clone()]);
         while let Some(submap) = open.pop_front() {
-            let (here, pose) = (along[&submap].clone(), chain_from_submap[&submap]);
+            let (parent, pose) = (index[&submap], chain_from_submap[&submap]);
             for edge in adjacent.get(&submap).into_iter().flatten() {
                 let forward = edge.from == submap;
                 let next = if forward { &edge.to } else { &edge.from };
-                if along.contains_key(next) {
+                if index.contains_key(next) {
                     continue;
                 }
                 let between = if forward { edge.from_from_to } else { edge.from_from_to.inverse() };
@@ -165,38 +169,46 @@ impl Trunk {
                 // The measurement's error sits at its `to` end; seen from the chain's frame these errors add up.
                 let carry = se3::adjoint(if forward { &next_pose } else { &pose });
                 let own = edge.information.cholesky().map_or_else(Matrix6::zeros, |factor| factor.inverse());
-                let step = Along {
-                    parent: Some(submap.clone()),
-                    depth: here.depth + 1,
-                    covariance: here.covariance + carry * own * carry.transpose(),
-                };
-                along.insert(next.clone(), step);
+                let covariance = along[parent].covariance + carry * own * carry.transpose();
+                index.insert(next.clone(), along.len());
+                along.push(Along { parent, depth: along[parent].depth + 1, covariance });
                 chain_from_submap.insert(next.clone(), next_pose);
                 open.push_back(next.clone());
             }
         }
-        Trunk { chain_from_submap, along }
+        Trunk { chain_from_submap, lonely: BTreeSet::new(), index, along }
     }
 
     /// `a_from_b` with the covariance of the odometry between the two. `None` if one is not in the chain.
     pub fn between(&self, a: &SubmapId, b: &SubmapId) -> Option<UncertainPose> {
         let chain_from_b = self.chain_from_submap.get(b)?;
         let pose = self.chain_from_submap.get(a)?.inv_mul(chain_from_b);
-        let fork = self.fork(a, b)?;
-        let spread = self.along[a].covariance + self.along[b].covariance - self.along[fork].covariance * 2.0;
+        let (a, b) = (*self.index.get(a)?, *self.index.get(b)?);
+        let covariance = |k: usize| self.along[k].covariance;
+        let spread = covariance(a) + covariance(b) - covariance(self.fork(a, b)) * 2.0;
         let carry = se3::adjoint(&chain_from_b.inverse());
         let covariance = carry * spread * carry.transpose();
         Some(UncertainPose { pose, covariance: (covariance + covariance.transpose()) * 0.5 })
     }
 
+    /// Steps of odometry between two submaps. `None` if one is not in the chain.
+    pub fn steps_between(&self, a: &SubmapId, b: &SubmapId) -> Option<usize> {
+        let (a, b) = (*self.index.get(a)?, *self.index.get(b)?);
+        let depth = |k: usize| self.along[k].depth;
+        Some(depth(a) + depth(b) - 2 * depth(self.fork(a, b)))
+    }
+
+    /// Steps of odometry from the first submap. `None` if it is not in the chain.
+    pub fn depth(&self, submap: &SubmapId) -> Option<usize> {
+        Some(self.along[*self.index.get(submap)?].depth)
+    }
+
     /// The last submap that the ways to `a` and `b` share.
-    fn fork<'a>(&'a self, a: &SubmapId, b: &SubmapId) -> Option<&'a SubmapId> {
-        let (mut a, _) = self.along.get_key_value(a)?;
-        let (mut b, _) = self.along.get_key_value(b)?;
+    fn fork(&self, mut a: usize, mut b: usize) -> usize {
         while a != b {
             let deeper = if self.along[a].depth >= self.along[b].depth { &mut a } else { &mut b };
-            *deeper = self.along[*deeper].parent.as_ref()?;
+            *deeper = self.along[*deeper].parent;
         }
-        Some(a)
+        a
     }
 }

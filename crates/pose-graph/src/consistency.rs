@@ -59,3 +59,35 @@ pub fn largest_consistent_set(
     }
     largest(&agree, settings)
 }
+
+/// Two loops of one chain test each other if odometry needs at most this many steps from ends to ends: farther apart
+/// its drift lets nearly everything agree.
+pub const STEPS_THAT_TEST: usize = 30;
+
+/// Which loops within a chain no other one supports, where most have support: `lonely[loop]`. A loop is supported if
+/// another one close by agrees with it. Where loops are too sparse to test each other none is lonely.
+pub fn lonely(loops: &[&Edge], trunk: &Trunk, limit: f64) -> Vec<bool> {
+    let mut bridges: Vec<(usize, usize, Bridge)> = Vec::new();
+    for (k, edge) in loops.iter().enumerate() {
+        let depths = trunk.depth(&edge.from).zip(trunk.depth(&edge.to));
+        if let Some((from, to)) = depths
+            && let Some(bridge) = Bridge::new(edge, from <= to)
+        {
+            bridges.push((from.min(to), k, bridge));
+        }
+    }
+    bridges.sort_by_key(|(depth, k, _)| (*depth, *k));
+    let mut supported = vec![false; loops.len()];
+    for (n, (depth, k, a)) in bridges.iter().enumerate() {
+        for (_, other, b) in bridges[n + 1..].iter().take_while(|(d, _, _)| d - depth <= STEPS_THAT_TEST) {
+            let steps = |x, y| trunk.steps_between(x, y).unwrap_or(usize::MAX / 2);
+            let tested = steps(&a.in_s, &b.in_s) + steps(&a.in_t, &b.in_t) <= STEPS_THAT_TEST;
+            if tested && !(supported[*k] && supported[*other]) && cycle_error(a, b, trunk, trunk) <= limit {
+                supported[*k] = true;
+                supported[*other] = true;
+            }
+        }
+    }
+    let enough = 2 * supported.iter().filter(|s| **s).count() >= loops.len();
+    supported.iter().map(|s| enough && !s).collect()
+}

@@ -1,15 +1,13 @@
 //! Global phase (eq. 10): the canonical solve of a cut.
 
 use crate::chain::{Chain, Trunk, chains, extend_by_composition};
-use crate::consistency::Bridge;
+use crate::consistency::{Bridge, lonely};
 use crate::gnc::{self, RobustSettings, RobustSolved, Trust};
 use crate::graph::{DEFAULT_ANCHOR_PRIORITY, Edge, EdgeKey, GraphEntries, NodeInfo, UsableGraph};
 use crate::relative::{JoinSettings, Joined, NotJoined, join};
-use crate::solution::{
-    Component, LoopVerdict, LoopWeight, MapId, PairJoin, PairReport, Solution, pose_digest,
-};
+use crate::solution::{Component, LoopVerdict, LoopWeight, PairJoin, PairReport, Solution, pose_digest};
 use crate::solver::{Constraint, Problem, SolveError, SolverSettings};
-use coma_geometry::{AgentId, Pose, SubmapId};
+use coma_geometry::{AgentId, MapId, Pose, SubmapId};
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -35,8 +33,9 @@ pub struct GlobalSettings {
 pub fn solve(entries: &GraphEntries, settings: &GlobalSettings) -> Solution {
     let graph = UsableGraph::new(entries);
     let chains = chains(&graph);
-    let pairs = chain_pairs(&graph.loops, &chains);
-    let trunks = lay_out(&chains, &graph.loops, &pairs, settings);
+    let chain_of = chain_of(&chains);
+    let pairs = chain_pairs(&graph.loops, &chain_of);
+    let trunks = lay_out(&chains, &graph.loops, &chain_of, &pairs, settings);
     let joins: BTreeMap<(usize, usize), Result<Joined, NotJoined>> = pairs
         .iter()
         .map(|(&(s, t), between)| {
@@ -46,7 +45,9 @@ pub fn solve(entries: &GraphEntries, settings: &GlobalSettings) -> Solution {
         .collect();
     let mut components: Vec<Component> = connected_chains(chains.len(), &joins)
         .iter()
-        .map(|members| solve_component(members, &chains, &trunks, &graph, &joins, &pairs, entries, settings))
+        .map(|members| {
+            solve_component(members, &chains, &chain_of, &trunks, &graph, &joins, &pairs, entries, settings)
+        })
         .collect();
     components.sort_by(|a, b| a.map_id.cmp(&b.map_id));
     let mut hasher = blake3::Hasher::new();
@@ -67,11 +68,24 @@ pub fn solve(entries: &GraphEntries, settings: &GlobalSettings) -> Solution {
 type Between<'a> = Vec<(&'a Edge, bool)>;
 type Joins = BTreeMap<(usize, usize), Result<Joined, NotJoined>>;
 
-fn chain_pairs<'a>(loops: &'a [Edge], chains: &[Chain]) -> BTreeMap<(usize, usize), Between<'a>> {
-    let mut chain_of = BTreeMap::new();
+/// The chain that holds each submap.
+type ChainOf<'a> = BTreeMap<&'a SubmapId, usize>;
+
+fn chain_of(chains: &[Chain]) -> ChainOf<'_> {
+    let mut out = ChainOf::new();
     for (index, chain) in chains.iter().enumerate() {
-        chain_of.extend(chain.submaps.iter().map(|s| (s, index)));
+        out.extend(chain.submaps.iter().map(|s| (s, index)));
     }
+    out
+}
+
+/// The chain that holds both ends of a loop.
+fn chain_within(chain_of: &ChainOf, edge: &Edge) -> Option<usize> {
+    let (from, to) = (chain_of.get(&edge.from)?, chain_of.get(&edge.to)?);
+    (from == to).then_some(*from)
+}
+
+fn chain_pairs<'a>(loops: &'a [Edge], chain_of: &ChainOf) -> BTreeMap<(usize, usize), Between<'a>> {
     let mut pairs: BTreeMap<(usize, usize), Between> = BTreeMap::new();
     for edge in loops {
         if let (Some(&a), Some(&b)) = (chain_of.get(&edge.from), chain_of.get(&edge.to))
@@ -87,19 +101,29 @@ fn chain_pairs<'a>(loops: &'a [Edge], chains: &[Chain]) -> BTreeMap<(usize, usiz
 fn lay_out(
     chains: &[Chain],
     loops: &[Edge],
+    chain_of: &ChainOf,
     pairs: &BTreeMap<(usize, usize), Between>,
     settings: &GlobalSettings,
 ) -> Vec<Trunk> {
+    let mut own_loops: Vec<Vec<&Edge>> = vec![Vec::new(); chains.len()];
+    for edge in loops {
+        if let Some(chain) = chain_within(chain_of, edge) {
+            own_loops[chain].push(edge);
+        }
+    }
     let paired: BTreeSet<usize> = pairs.keys().flat_map(|(s, t)| [*s, *t]).collect();
     let lay_out_one = |(index, chain): (usize, &Chain)| {
         let mut trunk = Trunk::new(chain);
-        let own = |e: &&Edge| chain.submaps.contains(&e.from) && chain.submaps.contains(&e.to);
-        let own: Vec<&Edge> = loops.iter().filter(own).collect();
+        let own = &own_loops[index];
+        let limit = settings.robust.squared_error_6dof;
+        let apart: Vec<bool> = lonely(own, &trunk, limit);
+        trunk.lonely.extend(own.iter().zip(&apart).filter(|(_, l)| **l).map(|(e, _)| e.key.clone()));
         if paired.contains(&index) && !own.is_empty() {
-            let trust = vec![Trust::Doubted; own.len()];
+            let trust: Vec<Trust> =
+                apart.iter().map(|l| if *l { Trust::Suspended } else { Trust::Doubted }).collect();
             let robust = Indexed::new(&trunk.chain_from_submap, &chain.first).solve(
                 chain.solved_odometry.iter(),
-                &own,
+                own,
                 &trust,
                 settings,
             );
@@ -237,6 +261,7 @@ impl<'a> Indexed<'a> {
 fn solve_component(
     members: &[usize],
     chains: &[Chain],
+    chain_of: &ChainOf,
     trunks: &[Trunk],
     graph: &UsableGraph,
     joins: &Joins,
@@ -256,15 +281,12 @@ fn solve_component(
     let contradicting = contradicting(pairs, joins);
     // A loop that nothing supports is left out until the others say where its ends are.
     let supported = supported(pairs, joins);
-    let trust: Vec<Trust> = loops
-        .iter()
-        .map(|e| {
-            let within_a_chain = members
-                .iter()
-                .any(|&k| chains[k].submaps.contains(&e.from) && chains[k].submaps.contains(&e.to));
-            if within_a_chain || supported.contains(&e.key) { Trust::Doubted } else { Trust::Suspended }
-        })
-        .collect();
+    let believed = |e: &Edge| match chain_within(chain_of, e) {
+        Some(k) => !trunks[k].lonely.contains(&e.key),
+        None => supported.contains(&e.key),
+    };
+    let trust: Vec<Trust> =
+        loops.iter().map(|e| if believed(e) { Trust::Doubted } else { Trust::Suspended }).collect();
     let odometry = members.iter().flat_map(|&k| chains[k].solved_odometry.iter());
     let (submaps, outcome) = Indexed::new(&start, &gauge).solve(odometry, &loops, &trust, settings);
     let weigh = |edge: &Edge, weight: f64, poses: &BTreeMap<SubmapId, Pose>| {

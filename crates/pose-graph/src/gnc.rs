@@ -1,6 +1,7 @@
 //! Graduated non-convexity (Yang, Antonante, Tzoumas, Carlone, RA-L 2020): least squares that ends up
 //! ignoring measurements which do not fit, without a good start.
 
+use crate::polish::Polish;
 use crate::solver::{Problem, SolveError, Solved, Solver, SolverSettings};
 use coma_geometry::Pose;
 use serde::{Deserialize, Serialize};
@@ -124,10 +125,10 @@ pub enum Trust {
     Suspended,
 }
 
-/// Most rounds under the final cost; a few settle it.
-const POLISH_ROUNDS: u32 = 20;
-/// A loop in use is asked about only if its squared error is above this share of the limit.
-const STRAINED: f64 = 0.25;
+/// Weights that change by less than this, all together, do not move the graph,
+const UNCHANGED: f64 = 0.5;
+/// nor do those that change by less than this on average.
+const UNCHANGED_EACH: f64 = 1e-3;
 
 /// A solution with the weights that it was reached with.
 #[derive(Clone, Debug, PartialEq)]
@@ -151,8 +152,15 @@ pub fn solve(
 ) -> Result<RobustSolved, SolveError> {
     let initial = |t: &Trust| if *t == Trust::Suspended { 0.0 } else { 1.0 };
     let mut weights: Vec<f64> = trust.iter().map(initial).collect();
-    let mut solver = Solver::new(problem, &weights)?;
-    let mut solved = solver.solve(start, &weights, settings)?;
+    // What is suspended gets a place in the system when it gets a weight.
+    let in_pattern: Vec<bool> = trust.iter().map(|t| *t != Trust::Suspended).collect();
+    let mut solver = Solver::with_pattern(problem, &weights, &in_pattern)?;
+    // Rounds on the way need no precision.
+    let rough = SolverSettings { relative_decrease: 1e-3, max_iterations: 10, ..*settings };
+    let mut solved = solver.solve(start, &weights, &rough)?;
+    // From there on steps start near a minimum: damping would only slow them down along what is known least.
+    let settings = &SolverSettings { initial_damping: 1e-4 * settings.initial_damping, ..*settings };
+    let rough = SolverSettings { initial_damping: settings.initial_damping, ..rough };
     let initial_cost = solved.initial_cost;
     let mut iterations = solved.iterations;
     let mut rounds = 0;
@@ -161,8 +169,6 @@ pub fn solve(
     let doubted: Vec<usize> = (0..trust.len()).filter(|&k| trust[k] == Trust::Doubted).collect();
     let largest = doubted.iter().map(|&k| squared(&solved.poses, k)).fold(0.0, f64::max);
     if let Some(mut schedule) = Schedule::new(robust.kernel, limit, robust.convexity_step, largest) {
-        // Rounds on the way need no precision.
-        let rough = SolverSettings { relative_decrease: 1e-4, max_iterations: 10, ..*settings };
         while rounds < robust.max_rounds {
             rounds += 1;
             let mut next = weights.clone();
@@ -173,9 +179,13 @@ pub fn solve(
             if !connected(problem, &next) {
                 break;
             }
+            let change: f64 = next.iter().zip(&weights).map(|(a, b)| (a - b).abs()).sum();
             weights = next;
-            solved = solver.solve(&solved.poses, &weights, &rough)?;
-            iterations += solved.iterations;
+            // Where next to nothing changes the next round may as well ask the same poses.
+            if rounds == 1 || change > UNCHANGED.min(UNCHANGED_EACH * doubted.len() as f64) {
+                solved = solver.solve(&solved.poses, &weights, &rough)?;
+                iterations += solved.iterations;
+            }
             let decided = robust.kernel == Kernel::TruncatedLeastSquares
                 && doubted.iter().all(|&k| weights[k] == 0.0 || weights[k] == 1.0);
             if decided || !schedule.advance() {
@@ -183,47 +193,15 @@ pub fn solve(
             }
         }
     }
-    // Under the robust cost itself, for all that may be doubted, until nothing changes. What was left out is judged by
-    // what taking it in would cost, not by the error that leaving it out has caused.
-    let questioned: Vec<usize> = (0..trust.len()).filter(|&k| trust[k] != Trust::Full).collect();
-    for _ in 0..POLISH_ROUNDS {
-        let mut next = weights.clone();
-        let out: Vec<usize> = questioned.iter().copied().filter(|&k| !(weights[k] > 0.0)).collect();
-        for &k in &questioned {
-            next[k] = final_weight(robust.kernel, limit, squared(&solved.poses, k));
-        }
-        if !out.is_empty() {
-            let innovations = solver.innovations(&solved.poses, &weights, &out)?;
-            for (&k, innovation) in out.iter().zip(innovations) {
-                next[k] = next[k].max(final_weight(robust.kernel, limit, innovation));
-            }
-        }
-        let changed = |next: &[f64]| next.iter().zip(&weights).any(|(a, b)| (a - b).abs() > 1e-3);
-        if robust.kernel == Kernel::TruncatedLeastSquares && !changed(&next) {
-            // A loop in use bends the graph towards itself: ask what the others say without it, and part with the
-            // one that they contradict most.
-            let strained = |&k: &usize| weights[k] > 0.0 && squared(&solved.poses, k) > STRAINED * limit;
-            let strained: Vec<usize> = questioned.iter().copied().filter(strained).collect();
-            let without = solver.innovations(&solved.poses, &weights, &strained)?;
-            let worst = strained.iter().zip(without).max_by(|(_, a), (_, b)| a.total_cmp(b));
-            if let Some((&k, _)) = worst.filter(|(_, squared)| *squared > limit) {
-                next[k] = 0.0;
-            }
-        }
-        if !changed(&next) || !connected(problem, &next) {
-            break;
-        }
-        rounds += 1;
-        weights = next;
-        solved = solver.solve(&solved.poses, &weights, settings)?;
-        iterations += solved.iterations;
-    }
+    let polish = Polish { problem, trust, robust, settings };
+    let (weights, more) = polish.settle(&mut solver, in_pattern, &mut solved, weights)?;
     solved = solver.solve(&solved.poses, &weights, settings)?;
-    iterations += solved.iterations;
-    Ok(RobustSolved { solved: Solved { initial_cost, iterations, ..solved }, weights, rounds })
+    iterations += solved.iterations + more.iterations;
+    let solved = Solved { initial_cost, iterations, ..solved };
+    Ok(RobustSolved { solved, weights, rounds: rounds + more.rounds })
 }
 
-fn connected(problem: &Problem, weights: &[f64]) -> bool {
+pub(crate) fn connected(problem: &Problem, weights: &[f64]) -> bool {
     problem.check(weights).is_ok()
 }
 

@@ -2,40 +2,8 @@
 
 use crate::graph::{Cut, EdgeKey, EntryName, EntryProblem};
 use crate::relative::NotJoined;
-use coma_geometry::{AgentId, Epoch, Pose, SubmapId};
+use coma_geometry::{AgentId, MapId, Pose, SubmapId};
 use std::collections::{BTreeMap, BTreeSet};
-use std::fmt;
-
-/// The name of a map: its gauge agent and epoch, and, for a part of an agent's run that has lost contact with
-/// the beginning, the number of that part's first submap (otherwise 0). The map's frame is this submap's.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct MapId {
-    /// The gauge agent.
-    pub agent: AgentId,
-    /// In which life.
-    pub epoch: Epoch,
-    /// Number of the submap whose frame is the map's.
-    pub first_submap: u32,
-}
-
-impl MapId {
-    /// The map whose frame is this submap's.
-    pub fn of(gauge: &SubmapId) -> Self {
-        MapId { agent: gauge.agent.clone(), epoch: gauge.epoch, first_submap: gauge.number }
-    }
-
-    /// The submap whose frame is the map's.
-    pub fn gauge(&self) -> SubmapId {
-        SubmapId { agent: self.agent.clone(), epoch: self.epoch, number: self.first_submap }
-    }
-}
-
-impl fmt::Display for MapId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}/{}", self.agent, self.epoch.0)?;
-        if self.first_submap == 0 { Ok(()) } else { write!(f, "/s{}", self.first_submap) }
-    }
-}
 
 /// The name of a published result.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -226,7 +194,7 @@ fn hash_submap(hasher: &mut blake3::Hasher, submap: &SubmapId) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use coma_geometry::{Tangent, se3};
+    use coma_geometry::{Epoch, Tangent, se3};
 
     #[test]
     fn digests_ignore_rounding_and_the_quaternion_s_sign_but_see_a_millimetre() {
@@ -242,12 +210,5 @@ mod tests {
         assert_eq!(digest(&pose), digest(&nudged));
         nudged.translation.vector.x += 1e-3;
         assert_ne!(digest(&pose), digest(&nudged));
-    }
-
-    #[test]
-    fn a_map_is_named_by_agent_and_epoch() {
-        let submap = SubmapId { agent: AgentId::new("a").unwrap(), epoch: Epoch(2), number: 0 };
-        assert_eq!(MapId::of(&submap).to_string(), "a/2");
-        assert_eq!(MapId::of(&SubmapId { number: 7, ..submap }).to_string(), "a/2/s7");
     }
 }

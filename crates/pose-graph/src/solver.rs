@@ -210,12 +210,22 @@ impl<'a> Solver<'a> {
     /// Checks the problem with the given weights, orders it and analyses its pattern. The pattern holds every
     /// constraint, so that weights may change from and to zero.
     pub fn new(problem: &'a Problem, weights: &[f64]) -> Result<Self, SolveError> {
-        Self::over(Cow::Borrowed(problem), weights)
+        Self::over(Cow::Borrowed(problem), weights, |_| true)
+    }
+
+    /// The same without a place for the constraints that `in_pattern` leaves out; their weights must stay zero. False
+    /// loops between far places would make the factor much larger.
+    pub fn with_pattern(
+        problem: &'a Problem,
+        weights: &[f64],
+        in_pattern: &[bool],
+    ) -> Result<Self, SolveError> {
+        Self::over(Cow::Borrowed(problem), weights, |k| in_pattern.get(k).copied().unwrap_or(false))
     }
 
     /// The same for a problem that it keeps.
     pub fn owning(problem: Problem, weights: &[f64]) -> Result<Solver<'static>, SolveError> {
-        Solver::over(Cow::Owned(problem), weights)
+        Solver::over(Cow::Owned(problem), weights, |_| true)
     }
 
     /// What is solved.
@@ -223,7 +233,11 @@ impl<'a> Solver<'a> {
         &self.problem
     }
 
-    fn over(problem: Cow<'a, Problem>, weights: &[f64]) -> Result<Self, SolveError> {
+    fn over(
+        problem: Cow<'a, Problem>,
+        weights: &[f64],
+        in_pattern: impl Fn(usize) -> bool,
+    ) -> Result<Self, SolveError> {
         problem.check(weights)?;
         let mut next = 0;
         let variable: Vec<Option<usize>> = problem
@@ -240,9 +254,11 @@ impl<'a> Solver<'a> {
         let pairs: Vec<(usize, usize)> = problem
             .constraints
             .iter()
-            .filter_map(|c| match ends(c) {
-                (Some(a), Some(b)) => Some((a, b)),
-                _ => None,
+            .enumerate()
+            .filter(|(k, _)| in_pattern(*k))
+            .filter_map(|(_, c)| {
+                let (a, b) = ends(c);
+                a.zip(b)
             })
             .collect();
         let system = BlockCholesky::new(next, &pairs)?;

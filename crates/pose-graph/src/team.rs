@@ -68,7 +68,7 @@ pub fn merged(graphs: &[G2oGraph]) -> Result<G2oGraph, TeamError> {
 }
 
 /// The entries of graphs that are one together, and the vertex of each submap. `information` replaces that of the files.
-/// Each edge is written by the robot that it starts from.
+/// Each loop is written by that of its two robots which has written fewer.
 pub fn entries(
     graphs: &[G2oGraph],
     believed: Believed,
@@ -89,20 +89,31 @@ pub fn entries(
         entries.nodes.insert(submap.clone(), node);
         submaps.insert(*id, submap);
     }
-    let mut written: BTreeMap<AgentId, u64> = BTreeMap::new();
-    for edge in whole.edges {
+    let kind = |edge: &G2oEdge| {
+        let (from, to) = (&submaps[&edge.from], &submaps[&edge.to]);
+        let odometry = from.agent == to.agent
+            && (believed == Believed::WithinARobot || from.number.abs_diff(to.number) == 1);
+        if odometry { EdgeKind::Odometry } else { EdgeKind::Loop }
+    };
+    // A file is a finished run: loops come last, so that the cut of a solve holds all of it.
+    let (odometry, loops): (Vec<&G2oEdge>, Vec<&G2oEdge>) =
+        whole.edges.iter().partition(|e| kind(e) == EdgeKind::Odometry);
+    let mut next: BTreeMap<AgentId, u64> = BTreeMap::new();
+    let mut loops_of: BTreeMap<AgentId, u64> = BTreeMap::new();
+    for edge in odometry.into_iter().chain(loops) {
         let (from, to) = (submaps[&edge.from].clone(), submaps[&edge.to].clone());
-        let within = from.agent == to.agent;
-        let odometry = match believed {
-            Believed::Consecutive => within && from.number.abs_diff(to.number) == 1,
-            Believed::WithinARobot => within,
-        };
-        let sequence = written.entry(from.agent.clone()).or_insert(0);
-        let key = EdgeKey { agent: from.agent.clone(), epoch: Epoch(0), sequence: *sequence };
+        let kind = kind(edge);
+        let count = |agent| loops_of.get(agent).copied().unwrap_or(0);
+        let author = if count(&to.agent) < count(&from.agent) { &to.agent } else { &from.agent }.clone();
+        if kind == EdgeKind::Loop {
+            *loops_of.entry(author.clone()).or_insert(0) += 1;
+        }
+        let sequence = next.entry(author.clone()).or_insert(0);
+        let key = EdgeKey { agent: author, epoch: Epoch(0), sequence: *sequence };
         *sequence += 1;
         entries.edges.push(Edge {
             key,
-            kind: if odometry { EdgeKind::Odometry } else { EdgeKind::Loop },
+            kind,
             from,
             to,
             from_from_to: edge.from_from_to,

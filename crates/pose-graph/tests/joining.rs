@@ -2,11 +2,11 @@
 
 mod world;
 
-use coma_geometry::{Epoch, Pose, se3};
+use coma_geometry::{Epoch, MapId, Pose, se3};
 use coma_pose_graph::g2o::G2oGraph;
 use coma_pose_graph::graph::{EntryName, EntryProblem};
 use coma_pose_graph::relative::NotJoined;
-use coma_pose_graph::{EdgeKey, EdgeKind, GlobalSettings, LoopVerdict, MapId, solve};
+use coma_pose_graph::{EdgeKey, EdgeKind, GlobalSettings, LoopVerdict, solve};
 use world::{World, agent, submap};
 
 fn two_agents(seed: u64) -> World {

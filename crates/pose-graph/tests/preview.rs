@@ -5,7 +5,7 @@ mod world;
 use coma_geometry::se3;
 use coma_pose_graph::preview::{Added, Preview};
 use coma_pose_graph::{GlobalSettings, GraphEntries, solve};
-use std::time::Instant;
+use std::time::{SystemTime, UNIX_EPOCH};
 use world::World;
 
 /// Four agents of 250 submaps that have met often.
@@ -26,6 +26,14 @@ fn thousand() -> World {
     world
 }
 
+/// What this thread has had of the processor; by the clock where the system does not tell. Others may be at work.
+fn processor_ms() -> f64 {
+    let told = std::fs::read_to_string("/proc/thread-self/schedstat").ok();
+    let told = told.and_then(|text| text.split_whitespace().next()?.parse::<u64>().ok());
+    let now = || SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default().as_nanos() as u64;
+    told.unwrap_or_else(now) as f64 * 1e-6
+}
+
 fn without_last(entries: &GraphEntries) -> GraphEntries {
     let mut before = entries.clone();
     before.edges.pop();
@@ -44,14 +52,16 @@ fn a_preview_with_a_new_loop_is_the_cold_solve_s_map() {
     let times: Vec<f64> = (0..5)
         .map(|_| {
             let mut again = preview.clone();
-            let clock = Instant::now();
+            let begin_ms = processor_ms();
             again.add(world.entries.edges.last().unwrap()).unwrap();
-            clock.elapsed().as_secs_f64() * 1e3
+            processor_ms() - begin_ms
         })
         .collect();
     let added = preview.add(world.entries.edges.last().unwrap()).unwrap();
     println!("{} submaps, a new loop: {times:.1?} ms, {added:?}", preview.map_from_submap().len());
     assert!(matches!(added, Added::Solved { weight: 1.0, .. }), "{added:?}");
+    let fastest = times.iter().copied().fold(f64::INFINITY, f64::min);
+    assert!(fastest < 30.0, "{times:?} ms");
     let cold = solve(&world.entries, &settings);
     let found = preview.map_from_submap();
     for (submap, pose) in &cold.components[0].map_from_submap {

@@ -2,72 +2,31 @@
 
 mod world;
 
-use coma_geometry::{AgentId, Epoch, Pose, SubmapId, se3};
-use coma_pose_graph::g2o::G2oGraph;
-use coma_pose_graph::{
-    Component, Edge, EdgeKey, EdgeKind, GlobalSettings, GraphEntries, NodeInfo, Solution, solve,
-};
-use std::collections::{BTreeMap, BTreeSet};
+use coma_geometry::{Epoch, SubmapId, se3};
+use coma_pose_graph::g2o::{G2oGraph, G2oLimits};
+use coma_pose_graph::team::{self, Believed};
+use coma_pose_graph::{Component, Edge, EdgeKey, EdgeKind, GlobalSettings, GraphEntries, Solution, solve};
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use world::{Random, information, shared_data};
-
-/// Vertex ids hold the robot's letter in their highest byte.
-fn name(vertex: u64) -> (char, u64) {
-    ((vertex >> 56) as u8 as char, vertex & 0x00ff_ffff_ffff_ffff)
-}
 
 struct Team {
     entries: GraphEntries,
     between_robots: usize,
 }
 
-/// One file per robot; edges between robots are in both files. Numbers within a robot are made consecutive.
-fn team(folder: &str, sigma: (f64, f64)) -> Team {
+/// What robots measured of themselves counts as odometry: they are blocks of a grid.
+fn team(folder: &str, (sigma_m, sigma_rad): (f64, f64)) -> Team {
     let folder = shared_data().join("pose-graphs").join(folder);
     let mut paths: Vec<PathBuf> = std::fs::read_dir(folder).unwrap().map(|f| f.unwrap().path()).collect();
     paths.sort();
-    let mut edges: BTreeMap<(u64, u64), Pose> = BTreeMap::new();
-    let mut vertices: BTreeSet<u64> = BTreeSet::new();
-    for path in paths {
-        // Edges to other robots name vertices of other files: read the lines of all files as one.
-        let text = std::fs::read_to_string(path).unwrap();
-        let own: String =
-            text.lines().filter(|l| l.starts_with("VERTEX")).map(|l| format!("{l}\n")).collect();
-        vertices.extend(G2oGraph::parse(&own).unwrap().vertices.keys());
-        for line in text.lines().filter(|l| l.starts_with("EDGE")) {
-            let ends: Vec<u64> =
-                line.split_whitespace().skip(1).take(2).map(|w| w.parse().unwrap()).collect();
-            let placed: String =
-                ends.iter().map(|id| format!("VERTEX_SE3:QUAT {id} 0 0 0 0 0 0 1\n")).collect();
-            let edge = G2oGraph::parse(&format!("{placed}{line}\n")).unwrap().edges.remove(0);
-            edges.insert((edge.from, edge.to), edge.from_from_to);
-        }
-    }
-    let submap = |vertex: u64| {
-        let (letter, _) = name(vertex);
-        let rank = vertices.iter().filter(|v| name(**v).0 == letter && **v < vertex).count();
-        SubmapId { agent: AgentId::new(&letter.to_string()).unwrap(), epoch: Epoch(0), number: rank as u32 }
+    let read = |path: &PathBuf| {
+        G2oGraph::parse_part(&std::fs::read_to_string(path).unwrap(), &G2oLimits::default()).unwrap()
     };
-    let mut entries = GraphEntries::default();
-    for &vertex in &vertices {
-        let node = NodeInfo { first_frame: 21 * name(vertex).1, agent_from_submap: Pose::identity() };
-        entries.nodes.insert(submap(vertex), node);
-    }
-    let mut between_robots = 0;
-    for ((from, to), from_from_to) in edges {
-        let (from, to) = (submap(from), submap(to));
-        // Robots are blocks of a grid here: what they measure of themselves counts as odometry.
-        let odometry = from.agent == to.agent;
-        between_robots += usize::from(from.agent != to.agent);
-        entries.edges.push(Edge {
-            key: EdgeKey { agent: from.agent.clone(), epoch: Epoch(0), sequence: entries.edges.len() as u64 },
-            kind: if odometry { EdgeKind::Odometry } else { EdgeKind::Loop },
-            from,
-            to,
-            from_from_to,
-            information: information(sigma),
-        });
-    }
+    let graphs: Vec<G2oGraph> = paths.iter().map(read).collect();
+    let sure = team::information_of(sigma_m, sigma_rad);
+    let (entries, _) = team::entries(&graphs, Believed::WithinARobot, Some(sure)).unwrap();
+    let between_robots = entries.edges.iter().filter(|e| e.kind == EdgeKind::Loop).count();
     Team { entries, between_robots }
 }
 
@@ -78,11 +37,12 @@ fn rms_m(a: &Component, b: &Component) -> f64 {
 }
 
 /// Adds false loops between robots, solves, and counts the seeds in which the robots share one map, no false loop is
-/// used, and at least four in five of the true ones are.
+/// used, nine in ten of the true ones are, and the map is within 2 cm of the one without false loops.
 fn seeds_survived(folder: &str, sigma: (f64, f64), false_loops: usize) -> usize {
     let team = team(folder, sigma);
     let clean = solve(&team.entries, &GlobalSettings::default());
     assert_eq!(clean.components.len(), 1);
+    assert!(clean.components[0].composed.is_empty());
     let submaps: Vec<&SubmapId> = team.entries.nodes.keys().collect();
     let extent =
         clean.components[0].map_from_submap.values().map(|p| p.translation.vector.amax()).fold(0.0, f64::max);
@@ -93,7 +53,9 @@ fn seeds_survived(folder: &str, sigma: (f64, f64), false_loops: usize) -> usize 
         let mut added = BTreeSet::new();
         while added.len() < false_loops {
             let (from, to) = (submaps[random.below(submaps.len())], submaps[random.below(submaps.len())]);
-            if from.agent == to.agent {
+            // A second verdict on one pair would not count at all.
+            let known = |e: &Edge| (&e.from, &e.to) == (from, to) || (&e.from, &e.to) == (to, from);
+            if from.agent == to.agent || entries.edges.iter().any(known) {
                 continue;
             }
             let sequence = 5000 + added.len() as u64;
@@ -131,7 +93,7 @@ fn seeds_survived(folder: &str, sigma: (f64, f64), false_loops: usize) -> usize 
             good.len(),
             clock.elapsed().as_secs_f64() * 1e3
         );
-        survived += usize::from(whole && fooled == 0 && kept * 5 >= good.len() * 4);
+        survived += usize::from(whole && fooled == 0 && kept * 10 >= good.len() * 9 && rms <= 0.02);
     }
     survived
 }

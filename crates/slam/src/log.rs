@@ -5,7 +5,7 @@
 //! partitions need no special case: an entry is taken when it is the next of its log and its
 //! `previous_hash` fits, and left otherwise.
 
-use coma_geometry::{AgentId, Epoch, SubmapId};
+use coma_geometry::{AgentId, Epoch, MapId, SubmapId};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -288,8 +288,8 @@ pub struct LoopWithdrawn {
 /// What a solver made of a cut.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SolveDigest {
-    /// Gauge agent and its epoch.
-    pub map_id: (AgentId, Epoch),
+    /// Which map.
+    pub map_id: MapId,
     /// Entries that went in.
     pub cut: VersionVector,
     /// Of the poses.

@@ -25,7 +25,7 @@ pub use frame::{ColorData, DepthData, EncodedFrame, encode_frame, read_color, se
 pub use full::{full, is_full};
 pub use geometry::finite;
 pub use limited::Limited;
-pub use log::{entry_from_bytes, entry_to_bytes, hash, map_id, version_vector};
+pub use log::{entry_from_bytes, entry_to_bytes, hash, version_vector};
 pub use payload::{decode_payload, encode_payload};
 
 /// The words of the log that conversions give, for services that know agents by their messages alone.

@@ -3,7 +3,7 @@
 use crate::field::{At, FieldError, Wire, limits};
 use crate::v1;
 use bytes::Bytes;
-use coma_geometry::{AgentId, Epoch};
+use coma_geometry::{AgentId, Epoch, MapId};
 use coma_slam::log::{Entry, EntryKey, Hash, VersionVector};
 use prost::Message;
 
@@ -12,25 +12,21 @@ pub fn hash(bytes: &[u8], at: &At<'_>) -> Result<Hash, FieldError> {
     bytes.try_into().map_err(|_| at.refuse(format!("{} bytes, 32 are needed", bytes.len())))
 }
 
-/// Who holds a map's gauge, and in which life.
-pub fn map_id(message: v1::MapId, at: &At<'_>) -> Result<(AgentId, Epoch), FieldError> {
-    <(AgentId, Epoch)>::from_wire(message, at)
-}
-
 /// A version vector; absent means that nothing is known.
 pub fn version_vector(message: Option<v1::VersionVector>, at: &At<'_>) -> Result<VersionVector, FieldError> {
     Ok(at.optional(message)?.unwrap_or_default())
 }
 
-impl Wire for (AgentId, Epoch) {
+impl Wire for MapId {
     type Message = v1::MapId;
 
     fn to_wire(&self) -> v1::MapId {
-        v1::MapId { agent_id: self.0.to_wire(), epoch: self.1.0 }
+        v1::MapId { agent_id: self.agent.to_wire(), epoch: self.epoch.0, first_submap: self.first_submap }
     }
 
     fn from_wire(m: v1::MapId, at: &At<'_>) -> Result<Self, FieldError> {
-        Ok((AgentId::from_wire(m.agent_id, &at.field("agent_id"))?, Epoch(m.epoch)))
+        let agent = AgentId::from_wire(m.agent_id, &at.field("agent_id"))?;
+        Ok(MapId { agent, epoch: Epoch(m.epoch), first_submap: m.first_submap })
     }
 }
 

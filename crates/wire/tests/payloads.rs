@@ -1,6 +1,6 @@
 //! Payloads: they survive the wire bit for bit, and foreign bytes are refused without a panic.
 
-use coma_geometry::{AgentId, Epoch, Matrix6, Pose, StampNs, SubmapId};
+use coma_geometry::{AgentId, Epoch, MapId, Matrix6, Pose, StampNs, SubmapId};
 use coma_place::{Descriptor, Space};
 use coma_slam::log::*;
 use coma_wire::{At, Wire, decode_payload, encode_payload, v1};
@@ -100,16 +100,15 @@ fn payloads() -> impl Strategy<Value = Payload> {
             let verdict = EntryKey { agent: agent("b"), epoch: Epoch(1), sequence };
             Payload::LoopWithdrawn(LoopWithdrawn { verdict, message })
         }),
-        (any::<[u8; 32]>(), prop::collection::btree_map("[a-z]{1,8}", any::<u64>(), 0..5)).prop_map(
-            |(digest, heads)| {
+        (any::<[u8; 32]>(), any::<u32>(), prop::collection::btree_map("[a-z]{1,8}", any::<u64>(), 0..5))
+            .prop_map(|(digest, first_submap, heads)| {
                 let cut = heads.into_iter().map(|(name, length)| ((agent(&name), Epoch(length % 7)), length));
                 Payload::SolveDigest(SolveDigest {
-                    map_id: (agent("a"), Epoch(2)),
+                    map_id: MapId { agent: agent("a"), epoch: Epoch(2), first_submap },
                     cut: cut.collect(),
                     digest,
                 })
-            }
-        ),
+            }),
     ]
 }
 

@@ -1,7 +1,7 @@
 //! What the agent knows, as messages of the contract.
 
 use crate::knowledge::{Knowledge, TrajectoryPose};
-use coma_geometry::SubmapId;
+use coma_geometry::{MapId, SubmapId};
 use coma_slam::loop_closure::corrections::{Correction, Generation};
 use coma_slam::tracking::State;
 use coma_wire::{At, FieldError, Wire, v1};
@@ -60,7 +60,7 @@ pub fn submap_info(knowledge: &Knowledge, id: &SubmapId) -> Option<v1::SubmapInf
     let placed = knowledge.place(&facts.opened);
     let map_id = match placed.generation {
         Some(generation) => generation.map_id.clone(),
-        None => (knowledge.agent.clone(), knowledge.epoch),
+        None => MapId { agent: knowledge.agent.clone(), epoch: knowledge.epoch, first_submap: 0 },
     };
     Some(v1::SubmapInfo {
         id: Some(id.to_wire()),
@@ -77,9 +77,8 @@ pub fn submap_info(knowledge: &Knowledge, id: &SubmapId) -> Option<v1::SubmapInf
 pub fn correction(component: v1::Component, at: &At<'_>) -> Result<Correction, FieldError> {
     let at_generation = at.field("generation");
     let g = component.generation.ok_or_else(|| at_generation.refuse("is missing"))?;
-    let map_id = at_generation.field("map_id");
     let generation = Generation {
-        map_id: coma_wire::map_id(g.map_id.ok_or_else(|| map_id.refuse("is missing"))?, &map_id)?,
+        map_id: at_generation.field("map_id").required(g.map_id)?,
         cut: coma_wire::version_vector(g.cut, &at_generation.field("cut"))?,
         digest: coma_wire::hash(&g.digest, &at_generation.field("digest"))?,
     };

@@ -64,6 +64,8 @@ pub struct Knowledge {
     pub corrections: Corrections,
     /// The last solve's components and what did not join, as they came.
     pub solved: v1::SolveResponse,
+    /// The components that this agent's own solver made, for peers; served are those in `solved`, which may be adopted.
+    pub own_results: Vec<v1::Component>,
     /// Own poses in order.
     pub trajectory: Vec<TrajectoryPose>,
     /// Own submaps.
@@ -101,6 +103,7 @@ impl Knowledge {
             closer,
             corrections: Corrections::default(),
             solved: v1::SolveResponse::default(),
+            own_results: Vec::new(),
             trajectory: Vec::new(),
             submaps: BTreeMap::new(),
             active: None,

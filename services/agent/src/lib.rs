@@ -118,7 +118,7 @@ impl Server {
         tasks.spawn(task::places::describe(node.clone(), inbox.anchors, place.clone()));
         tasks.spawn(task::places::index(node.clone(), place));
         tasks.spawn(task::verify::run(node.clone(), peers.clone()));
-        tasks.spawn(task::solve::run(node.clone(), dpgo));
+        tasks.spawn(task::solve::run(node.clone(), peers.clone(), dpgo));
         tasks.spawn(find_peers(node.clone(), peers, inbox.found, agent_id.to_string(), epoch.0));
 
         let resume = worker::resume_from(&node, &restored.checkpoints)?;

@@ -38,10 +38,9 @@ fn cut(graph: &Graph, solution: &Solution) -> VersionVector {
 }
 
 fn component(component: &Component, cut: &VersionVector) -> v1::Component {
-    let map_id = (component.map_id.agent.clone(), component.map_id.epoch);
     v1::Component {
         generation: Some(v1::Generation {
-            map_id: Some(map_id.to_wire()),
+            map_id: Some(component.map_id.to_wire()),
             cut: Some(cut.to_wire()),
             digest: component.digest.to_vec().into(),
         }),

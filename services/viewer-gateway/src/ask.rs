@@ -4,7 +4,7 @@ use crate::error::ApiError;
 use axum::body::{Body, to_bytes};
 use axum::extract::{FromRequest, FromRequestParts, Query, Request};
 use axum::http::request::Parts;
-use coma_geometry::{AgentId, Epoch, SubmapId};
+use coma_geometry::{AgentId, Epoch, InvalidMapId, MapId, SubmapId};
 use serde::de::DeserializeOwned;
 use std::error::Error;
 
@@ -80,12 +80,9 @@ pub fn agent_id(field: &str, text: &str) -> Result<AgentId, ApiError> {
     AgentId::new(text).map_err(|e| ApiError::bad(field, e.to_string()))
 }
 
-/// `agent-00/1`: a map's gauge agent and its epoch.
-pub fn map_id(field: &str, text: &str) -> Result<(AgentId, Epoch), ApiError> {
-    let shown: String = text.chars().take(100).collect();
-    let refuse = || ApiError::bad(field, format!("{shown:?} is no map: agent/epoch is needed"));
-    let (agent, epoch) = text.split_once('/').ok_or_else(refuse)?;
-    Ok((agent_id(field, agent)?, Epoch(epoch.parse().map_err(|_| refuse())?)))
+/// `agent-00/1` or `agent-00/1/s7`: a map.
+pub fn map_id(field: &str, text: &str) -> Result<MapId, ApiError> {
+    text.parse().map_err(|e: InvalidMapId| ApiError::bad(field, e.to_string()))
 }
 
 /// The parts of `agent-00/1/s3`.
@@ -99,9 +96,4 @@ pub fn submap_id((agent, epoch, number): (String, String, String)) -> Result<Sub
             .and_then(|n| n.parse().ok())
             .ok_or_else(|| refuse("number", "submap number: s and digits are needed"))?,
     })
-}
-
-/// A map's name as text.
-pub fn map_text(map: &(AgentId, Epoch)) -> String {
-    format!("{}/{}", map.0, map.1.0)
 }

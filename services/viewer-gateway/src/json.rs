@@ -1,8 +1,7 @@
 //! The words of the JSON answers. Metres, radians, pixels; transforms name both ends. Numbers that need all 64
 //! bits (stamps, revisions) are texts, because browsers read numbers as `f64`.
 
-use crate::ask::map_text;
-use coma_geometry::{AgentId, Epoch, SubmapId};
+use coma_geometry::{AgentId, Epoch, MapId, SubmapId};
 use coma_wire::{At, FieldError, Wire, v1};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -115,7 +114,7 @@ impl FramePose {
         let map_from_camera: Option<coma_geometry::Pose> =
             at.field("map_from_camera").optional(m.map_from_camera)?;
         let map = m.generation.and_then(|g| g.map_id);
-        let map = map.map(|map| coma_wire::map_id(map, &at.field("generation.map_id"))).transpose()?;
+        let map: Option<MapId> = at.field("generation.map_id").optional(map)?;
         Ok(FramePose {
             stamp_ns: m.stamp_ns,
             sequence: m.sequence,
@@ -123,7 +122,7 @@ impl FramePose {
             submap_from_camera: (&submap_from_camera).into(),
             agent_from_camera: (&agent_from_camera).into(),
             map_from_camera: map_from_camera.as_ref().map(Pose::from),
-            map: map.as_ref().map(map_text),
+            map: map.map(|map| map.to_string()),
             state: m.state.into(),
             reasons: m.reasons,
         })
@@ -167,13 +166,12 @@ pub struct Generation {
 impl Generation {
     /// Checked.
     pub fn read(m: v1::Generation, at: &At<'_>) -> Result<Self, FieldError> {
-        let at_map = at.field("map_id");
-        let map = coma_wire::map_id(m.map_id.ok_or_else(|| at_map.refuse("is missing"))?, &at_map)?;
+        let map: MapId = at.field("map_id").required(m.map_id)?;
         let cut = coma_wire::version_vector(m.cut, &at.field("cut"))?;
         let digest = coma_wire::hash(&m.digest, &at.field("digest"))?;
         Ok(Generation {
-            map: map_text(&map),
-            cut: cut.iter().map(|(log, length)| (map_text(log), *length)).collect(),
+            map: map.to_string(),
+            cut: cut.iter().map(|(log, length)| (log_text(&log.0, log.1), *length)).collect(),
             digest: digest.iter().map(|byte| format!("{byte:02x}")).collect(),
         })
     }

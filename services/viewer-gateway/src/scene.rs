@@ -1,11 +1,10 @@
 //! What a map is made of: which submaps, where, and their surfels.
 
 use crate::agents::{Directory, Link, PlacedSubmap, failed};
-use crate::ask::map_text;
 use crate::cache::{CachedSurfels, SurfelCache};
 use crate::error::ApiError;
 use crate::json::Unreachable;
-use coma_geometry::{AgentId, Epoch, Pose};
+use coma_geometry::{MapId, Pose};
 use coma_surfel::SurfelCloud;
 use futures::{StreamExt, TryStreamExt, stream};
 use std::collections::BTreeMap;
@@ -17,7 +16,7 @@ const AT_ONCE: usize = 4;
 /// A map's submaps, and who has no part in it.
 pub struct Scene {
     /// Which map.
-    pub map: (AgentId, Epoch),
+    pub map: MapId,
     /// Sorted by id.
     pub submaps: Vec<PlacedSubmap>,
     /// Agents that did not answer.
@@ -34,7 +33,7 @@ pub async fn submaps(directory: &Directory) -> (Vec<PlacedSubmap>, Vec<Unreachab
 }
 
 /// The submaps of one map; without a name, of the map with most surfels.
-pub async fn scene(directory: &Directory, map: Option<(AgentId, Epoch)>) -> Result<Scene, ApiError> {
+pub async fn scene(directory: &Directory, map: Option<MapId>) -> Result<Scene, ApiError> {
     let (mut submaps, unreachable) = submaps(directory).await;
     let nothing = || {
         let why = unreachable.iter().map(|u| format!("{}: {}", u.endpoint, u.error)).collect::<Vec<_>>();
@@ -47,13 +46,13 @@ pub async fn scene(directory: &Directory, map: Option<(AgentId, Epoch)>) -> Resu
     };
     submaps.retain(|submap| submap.map == map);
     if submaps.is_empty() {
-        return Err(ApiError::not_found("map", format!("no agent has a submap in map {}", map_text(&map))));
+        return Err(ApiError::not_found("map", format!("no agent has a submap in map {map}")));
     }
     Ok(Scene { map, submaps, unreachable })
 }
 
-fn largest(submaps: &[PlacedSubmap]) -> Option<(AgentId, Epoch)> {
-    let mut surfels: BTreeMap<&(AgentId, Epoch), u64> = BTreeMap::new();
+fn largest(submaps: &[PlacedSubmap]) -> Option<MapId> {
+    let mut surfels: BTreeMap<&MapId, u64> = BTreeMap::new();
     for submap in submaps {
         let sum = surfels.entry(&submap.map).or_default();
         *sum = sum.saturating_add(submap.surfels);
@@ -96,7 +95,7 @@ pub async fn load(
 ) -> Result<Vec<Placed>, ApiError> {
     let surfels = scene.submaps.iter().fold(0u64, |sum, submap| sum.saturating_add(submap.surfels));
     if surfels > max_surfels as u64 {
-        let map = map_text(&scene.map);
+        let map = scene.map.to_string();
         let message =
             format!("map {map} has {surfels} surfels, at most {max_surfels} (max_surfels) are taken");
         return Err(ApiError::too_large("map", message));
@@ -124,7 +123,7 @@ pub async fn load(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use coma_geometry::SubmapId;
+    use coma_geometry::{AgentId, Epoch, SubmapId};
 
     #[test]
     fn the_map_with_most_surfels_is_taken_and_of_equals_the_first() {
@@ -135,9 +134,9 @@ mod tests {
             revision: 1,
             agent_from_submap: Pose::identity(),
             map_from_submap: Pose::identity(),
-            map: (AgentId::new(map).unwrap(), Epoch(0)),
+            map: MapId { agent: AgentId::new(map).unwrap(), epoch: Epoch(0), first_submap: 0 },
         };
-        let name = |submaps: &[PlacedSubmap]| largest(submaps).map(|map| map_text(&map));
+        let name = |submaps: &[PlacedSubmap]| largest(submaps).map(|map| map.to_string());
         assert_eq!(name(&[]), None);
         assert_eq!(name(&[submap("a", "a", 5), submap("b", "b", 5)]).as_deref(), Some("a/0"));
         let three = [submap("a", "a", 5), submap("b", "b", 3), submap("c", "b", 3)];

@@ -1,14 +1,15 @@
 //! One agent of a block-by-block solve, as a state machine: [`BlockAgent::receive`] takes what others say,
 //! [`BlockAgent::step`] descends once and gives what there is to say. It knows no clock and no network.
 
+use super::coarse::{Coarse, Summary};
 use super::local::Local;
 use super::message::Boundary;
 use super::{Block, BlockId, NodeId};
-use crate::gnc::{Kernel, final_weight};
+use crate::gnc::{Kernel, Schedule, final_weight};
 use crate::solver::{Constraint, SolveError, SolverSettings};
 use coma_geometry::{Pose, Tangent, se3};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// How an agent descends.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -24,21 +25,53 @@ pub struct BlockSettings {
     pub still_rad: f64,
     /// Largest squared Mahalanobis error of a doubted measurement that is believed.
     pub squared_error_6dof: f64,
-    /// How often a measurement's weight may change.
+    /// Factor by which the robust cost gets less convex in each coarse round, or, without those, whenever a block is
+    /// nearly still.
+    pub convexity_step: f64,
+    /// How often a measurement's weight may change under the robust cost itself.
     pub most_changes_of_weight: u32,
+    /// Steps between two rounds in which whole blocks move. 0 for none.
+    pub coarse_every: u32,
+    /// A block with more neighbours takes no part in that: what everybody has to know of it would be too much, and where
+    /// blocks have many neighbours news travels fast anyway.
+    pub coarse_most_neighbours: usize,
 }
 
 impl Default for BlockSettings {
     fn default() -> Self {
         BlockSettings {
             iterations_per_step: 3,
-            most_momentum: 0.7,
+            most_momentum: 0.5,
             still_m: 1e-5,
             still_rad: 1e-6,
             squared_error_6dof: 22.458,
+            convexity_step: 1.4,
             most_changes_of_weight: 4,
+            coarse_every: 6,
+            coarse_most_neighbours: 16,
         }
     }
+}
+
+/// So many descents without a coarse round, and an agent goes on with its doubts alone.
+const ALONE: u32 = 200;
+const KERNEL: Kernel = Kernel::TruncatedLeastSquares;
+
+/// Momentum that was too much is cut to this share,
+const KEPT: f64 = 0.7;
+/// and is slowly regained, by this factor in each step: what was too much while nodes found their places is not later.
+const REGAINED: f64 = 1.005;
+
+/// How far an agent is with its doubts (graduated non-convexity: in coarse rounds all agents together, otherwise each at
+/// its own pace).
+#[derive(Clone, Copy, Debug)]
+enum Doubt {
+    /// It was never still yet.
+    NotYet,
+    /// Under a cost that gets less convex.
+    Graduated(Schedule),
+    /// Under the robust cost itself.
+    Decided,
 }
 
 /// What an agent knows of a neighbour.
@@ -52,6 +85,10 @@ struct Neighbour {
     has_heard: u64,
     /// Nodes of ours that it has measurements to.
     boundary: Vec<NodeId>,
+    /// Coarse rounds that it has seen.
+    round: u64,
+    /// Of whom it knows the part in the next one.
+    have: BTreeSet<BlockId>,
 }
 
 /// The state of one agent.
@@ -65,6 +102,7 @@ pub struct BlockAgent {
     /// One per measurement of the block.
     weights: Vec<f64>,
     changes_of_weight: Vec<u32>,
+    doubt: Doubt,
     neighbours: BTreeMap<BlockId, Neighbour>,
     /// Rises with what others should hear.
     sequence: u64,
@@ -84,6 +122,9 @@ pub struct BlockAgent {
     farthest_rad: f64,
     /// The problem over what is placed and known at present.
     local: Option<Local>,
+    coarse: Coarse,
+    /// Descents since the last round.
+    descents: u32,
     /// Something was heard, or a descent is not finished.
     busy: bool,
     iterations: u64,
@@ -109,6 +150,7 @@ impl BlockAgent {
             poses: block.fixed.iter().map(|node| (*node, start(*node))).collect(),
             weights: block.edges.iter().map(|e| e.weight).collect(),
             changes_of_weight: vec![0; block.edges.len()],
+            doubt: Doubt::NotYet,
             block,
             settings,
             known: BTreeMap::new(),
@@ -123,6 +165,8 @@ impl BlockAgent {
             farthest_m: 0.0,
             farthest_rad: 0.0,
             local: None,
+            coarse: Coarse::default(),
+            descents: 0,
             busy: true,
             iterations: 0,
         }
@@ -150,6 +194,11 @@ impl BlockAgent {
         self.iterations
     }
 
+    /// Rounds in which whole blocks moved so far.
+    pub fn coarse_rounds(&self) -> u64 {
+        self.coarse.round
+    }
+
     /// True if there is nothing to do and every neighbour has heard all there is to hear.
     pub fn is_settled(&self) -> bool {
         !self.busy && self.neighbours.values().all(|n| n.has_heard >= self.sequence && !n.owed)
@@ -164,7 +213,25 @@ impl BlockAgent {
     pub fn receive(&mut self, message: &Boundary) {
         let Some(neighbour) = self.neighbours.get_mut(&message.from) else { return };
         neighbour.has_heard = neighbour.has_heard.max(message.heard.min(self.sequence));
-        neighbour.owed |= message.sequence > 0;
+        neighbour.owed |= message.sequence > 0 || !message.summaries.is_empty();
+        if message.round > neighbour.round {
+            neighbour.round = message.round;
+            neighbour.have.clear();
+        }
+        if message.round == neighbour.round {
+            neighbour.have.extend(&message.have);
+        }
+        for summary in &message.summaries {
+            self.coarse.take(message.towards, summary);
+        }
+        self.advance();
+        let carry = match self.coarse.round {
+            now if message.round == now => Pose::identity(),
+            now if message.round + 1 == now => self.coarse.moved(message.from),
+            // Poses that cannot be told come again.
+            _ => return,
+        };
+        let Some(neighbour) = self.neighbours.get_mut(&message.from) else { return };
         if message.sequence <= neighbour.heard {
             return;
         }
@@ -174,7 +241,7 @@ impl BlockAgent {
                 && (pose.rotation.quaternion().norm() - 1.0).abs() < 1e-6;
             if sound && self.block.neighbours.get(node) == Some(&message.from) {
                 self.busy = true;
-                if self.known.insert(*node, *pose).is_none() {
+                if self.known.insert(*node, carry * pose).is_none() {
                     self.local = None;
                 }
             }
@@ -191,25 +258,35 @@ impl BlockAgent {
 
     /// Descends once if there is news, and says where the boundary is to every neighbour that may not know.
     pub fn step(&mut self) -> Result<Vec<(BlockId, Boundary)>, SolveError> {
-        if self.busy {
+        let was_busy = self.busy;
+        if was_busy {
             self.busy = false;
             self.place()?;
             self.descend()?;
+            self.descents += 1;
             let changed = self.reweigh();
             if changed || self.has_moved() {
                 self.sequence += 1;
                 self.said.clone_from(&self.poses);
             }
         }
+        self.busy |= self.is_in_doubt();
+        self.summarise(was_busy);
         let mut out = Vec::new();
         let decided = |e: &super::BlockEdge| e.doubted && self.decides(&e.constraint);
+        let have: Vec<BlockId> = self.coarse.have().collect();
         for (id, neighbour) in &self.neighbours {
+            let (towards, summaries) = self.coarse.lacking(neighbour.round, &neighbour.have);
             let mut message = Boundary {
                 from: self.block.id,
                 sequence: 0,
                 heard: neighbour.heard,
                 poses: Vec::new(),
                 weights: Vec::new(),
+                round: self.coarse.round,
+                have: have.clone(),
+                towards,
+                summaries,
             };
             if neighbour.has_heard < self.sequence {
                 message.sequence = self.sequence;
@@ -224,12 +301,60 @@ impl BlockAgent {
                 let told = edges.filter(|(e, _)| decided(e) && leads_there(e));
                 message.weights = told.map(|(e, w)| (e.index, *w)).collect();
             }
-            if neighbour.owed || message.sequence > 0 {
+            if neighbour.owed || message.sequence > 0 || !message.summaries.is_empty() {
                 out.push((*id, message));
             }
         }
         self.neighbours.values_mut().for_each(|n| n.owed = false);
         Ok(out)
+    }
+
+    /// Says this block's part in the next coarse round: when it is time, or when someone else has begun it.
+    fn summarise(&mut self, was_busy: bool) {
+        let due = was_busy && self.descents >= self.settings.coarse_every || self.coarse.has_begun();
+        if !due || !self.takes_part() || self.coarse.has(self.block.id) {
+            return;
+        }
+        let largest = self.doubts().iter().map(|(_, squared)| *squared).fold(0.0, f64::max);
+        let summary = Summary::new(&self.block, &self.poses, &self.known, &self.weights, largest);
+        if let Some(summary) = summary {
+            self.coarse.take(self.coarse.round + 1, &summary);
+            self.advance();
+        }
+    }
+
+    fn is_in_doubt(&self) -> bool {
+        !matches!(self.doubt, Doubt::Decided) && self.block.edges.iter().any(|e| e.doubted)
+    }
+
+    fn takes_part(&self) -> bool {
+        self.settings.coarse_every > 0
+            && (1..=self.settings.coarse_most_neighbours).contains(&self.neighbours.len())
+    }
+
+    /// Moves whole blocks once everyone's part in a round is known.
+    fn advance(&mut self) {
+        if !self.coarse.advance() {
+            return;
+        }
+        let own = self.coarse.moved(self.block.id);
+        for pose in self.poses.values_mut().chain(self.said.values_mut()) {
+            *pose = own * *pose;
+            pose.rotation.renormalize();
+        }
+        for (node, pose) in &mut self.known {
+            let block = self.block.neighbours.get(node).copied();
+            *pose = block.map_or_else(Pose::identity, |block| self.coarse.moved(block)) * *pose;
+        }
+        self.descents = 0;
+        self.momentum = 0.0;
+        self.moved.clear();
+        (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
+        self.busy = true;
+        if !matches!(self.doubt, Doubt::Decided) && self.graduate(self.coarse.largest_squared()) {
+            self.sequence += 1;
+            self.said.clone_from(&self.poses);
+        }
     }
 
     /// Sets up the problem over what is known, and gives nodes that can be reached for the first time a place.
@@ -275,13 +400,14 @@ impl BlockAgent {
         self.usual_step = if self.usual_step > 0.0 { 0.8 * self.usual_step + 0.2 * length } else { length };
         self.least_step = self.least_step.min(self.usual_step);
         // Swinging around the minimum is what momentum does; swinging farther and farther is too much of it, as stale
-        // news makes it. In the end this is plain descent.
+        // news makes it.
         if self.usual_step > 3.0 * self.least_step {
-            self.most_momentum *= 0.7;
+            self.most_momentum *= KEPT;
             self.momentum = 0.0;
             self.moved.clear();
             self.least_step = self.usual_step;
         }
+        self.most_momentum = (self.most_momentum * REGAINED).min(self.settings.most_momentum);
         self.momentum = (self.momentum + 0.1).min(self.most_momentum);
         (self.farthest_m, self.farthest_rad) = (0.0, 0.0);
         for (node, step) in steps {
@@ -307,36 +433,79 @@ impl BlockAgent {
         })
     }
 
-    /// Once the block is nearly still, doubted measurements count if they fit. True if a weight has changed.
+    /// Once the block is nearly still, doubted measurements are weighed by how they fit. True if a weight has changed.
     fn reweigh(&mut self) -> bool {
         let settled = self.farthest_m < 1e3 * self.settings.still_m
             && self.farthest_rad < 1e3 * self.settings.still_rad;
-        let Some(local) = self.local.as_ref().filter(|_| settled) else { return false };
-        let mut next = self.weights.clone();
-        for (k, edge) in self.block.edges.iter().enumerate() {
-            let c = &edge.constraint;
-            let pose = |node: usize| {
-                let node = node as NodeId;
-                self.poses.get(&node).or_else(|| self.known.get(&node)).copied()
-            };
-            let (Some(from), Some(to)) = (pose(c.from), pose(c.to)) else { continue };
-            let frozen = self.changes_of_weight[k] >= self.settings.most_changes_of_weight;
-            if !edge.doubted || frozen || !self.decides(c) {
-                continue;
-            }
-            let error = crate::residual::residual(&from, &to, &c.from_from_to);
-            let squared = crate::residual::squared_mahalanobis(&error, &c.information);
-            next[k] = final_weight(Kernel::TruncatedLeastSquares, self.settings.squared_error_6dof, squared);
-        }
-        // Never let go of the last measurement that holds a node.
-        if next == self.weights || !local.holds(&next) {
+        if !settled || self.local.is_none() {
             return false;
         }
-        for (k, (new, old)) in next.iter().zip(&self.weights).enumerate() {
-            self.changes_of_weight[k] += u32::from(new != old);
+        if !matches!(self.doubt, Doubt::Decided) {
+            // In coarse rounds all agents go on together.
+            let largest = self.doubts().iter().map(|(_, squared)| *squared).fold(0.0, f64::max);
+            let alone = !self.takes_part() || self.descents > ALONE;
+            return alone && self.graduate(largest);
+        }
+        let mut next = self.weights.clone();
+        for (k, squared) in self.doubts() {
+            let weight = final_weight(KERNEL, self.settings.squared_error_6dof, squared);
+            if weight != next[k] && self.changes_of_weight[k] < self.settings.most_changes_of_weight {
+                self.changes_of_weight[k] += 1;
+                next[k] = weight;
+            }
+        }
+        self.weigh(next)
+    }
+
+    /// One step of graduated non-convexity; `largest` is the largest squared error where it begins. True if a weight has
+    /// changed.
+    fn graduate(&mut self, largest: f64) -> bool {
+        let begin = || {
+            let limit = self.settings.squared_error_6dof;
+            Schedule::new(KERNEL, limit, self.settings.convexity_step, largest)
+        };
+        let schedule = match self.doubt {
+            Doubt::Graduated(schedule) => Some(schedule),
+            _ => begin(),
+        };
+        let Some(mut schedule) = schedule else {
+            self.doubt = Doubt::Decided;
+            return false;
+        };
+        let mut next = self.weights.clone();
+        self.doubts().into_iter().for_each(|(k, squared)| next[k] = schedule.weight(squared));
+        self.doubt = if schedule.advance() { Doubt::Graduated(schedule) } else { Doubt::Decided };
+        self.busy = true;
+        self.weigh(next)
+    }
+
+    fn weigh(&mut self, next: Vec<f64>) -> bool {
+        // Never let go of the last measurement that holds a node.
+        let holds = self.local.as_ref().is_some_and(|local| local.holds(&next));
+        if next == self.weights || !holds {
+            return false;
         }
         self.weights = next;
         self.busy = true;
         true
+    }
+
+    /// The doubted measurements that this block decides on, with their squared errors where both ends are known.
+    fn doubts(&self) -> Vec<(usize, f64)> {
+        let asked =
+            |k: &usize| self.block.edges[*k].doubted && self.decides(&self.block.edges[*k].constraint);
+        let edges = (0..self.block.edges.len()).filter(asked);
+        edges.filter_map(|k| Some((k, self.squared_error(k)?))).collect()
+    }
+
+    /// Of a measurement, where both its ends are known.
+    fn squared_error(&self, edge: usize) -> Option<f64> {
+        let c = &self.block.edges[edge].constraint;
+        let pose = |node: usize| {
+            let node = node as NodeId;
+            self.poses.get(&node).or_else(|| self.known.get(&node))
+        };
+        let error = crate::residual::residual(pose(c.from)?, pose(c.to)?, &c.from_from_to);
+        Some(crate::residual::squared_mahalanobis(&error, &c.information))
     }
 }

@@ -7,10 +7,12 @@
 //!
 //! * [`cut`]: blocks of a problem.
 //! * [`agent`]: one agent's state machine: messages in, messages out.
+//! * [`coarse`]: whole blocks move, so that what is far apart need not wait for what lies between.
 //! * [`message`]: what they say.
 //! * [`simulation`]: many agents in one process, over a network that loses and delays.
 
 pub mod agent;
+pub mod coarse;
 pub mod cut;
 mod local;
 pub mod message;

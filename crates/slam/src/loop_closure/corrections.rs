@@ -1,14 +1,14 @@
 //! Where every submap lies in the map, by the newest solve of the graph (eq. 13: whole submaps move).
 
 use crate::log::{Hash, SubmapOpened, VersionVector};
-use coma_geometry::{AgentId, Epoch, Pose, SubmapId};
+use coma_geometry::{MapId, Pose, SubmapId};
 use std::collections::BTreeMap;
 
 /// Names one published result.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Generation {
-    /// The gauge agent and its epoch.
-    pub map_id: (AgentId, Epoch),
+    /// Which map.
+    pub map_id: MapId,
     /// Entries that went in.
     pub cut: VersionVector,
     /// Of the poses.
@@ -43,6 +43,18 @@ impl Corrections {
     /// Replaces everything: a correction is whole.
     pub fn replace(&mut self, components: Vec<Correction>) {
         self.components = components;
+    }
+
+    /// Takes another agent's result of the same map in the place of the own one. False if that map is not there.
+    pub fn adopt(&mut self, correction: Correction) -> bool {
+        let same_map = |c: &&mut Correction| c.generation.map_id == correction.generation.map_id;
+        match self.components.iter_mut().find(same_map) {
+            Some(own) => {
+                *own = correction;
+                true
+            }
+            None => false,
+        }
     }
 
     /// All components.
@@ -86,7 +98,7 @@ impl Corrections {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use coma_geometry::StampNs;
+    use coma_geometry::{AgentId, Epoch, StampNs};
 
     fn opened(number: u32, chain: u32) -> SubmapOpened {
         SubmapOpened {
@@ -101,11 +113,8 @@ mod tests {
     #[test]
     fn a_submap_after_the_cut_follows_the_last_solved_one_of_its_chain() {
         let mut corrections = Corrections::default();
-        let generation = Generation {
-            map_id: (AgentId::new("a").unwrap(), Epoch(1)),
-            cut: VersionVector::new(),
-            digest: [0; 32],
-        };
+        let generation =
+            Generation { map_id: MapId::of(&opened(0, 0).id), cut: VersionVector::new(), digest: [0; 32] };
         let solved = BTreeMap::from([(opened(3, 0).id, Pose::translation(10.0, 0.0, 0.0))]);
         corrections.replace(vec![Correction { generation, map_from_submap: solved }]);
         let facts = |id: &SubmapId| Some(opened(id.number, 0));

@@ -4,6 +4,7 @@
 //! agent is to verify are handed out one by one; each ends as a verdict in this agent's log. Nothing is
 //! tried twice, and nothing waits for a coordinator.
 
+pub mod agreement;
 pub mod corrections;
 
 use crate::log::{AnchorDescribed, EntryKey, LoopOutcome, LoopVerdict, Payload, SubmapOpened};
@@ -117,6 +118,7 @@ pub struct LoopCloser {
     /// Anchors for which place recognition has no room.
     no_room: BTreeSet<SubmapId>,
     graph_changed: bool,
+    agreement: agreement::Agreement,
 }
 
 impl LoopCloser {
@@ -133,7 +135,13 @@ impl LoopCloser {
             to_insert: BTreeSet::new(),
             no_room: BTreeSet::new(),
             graph_changed: false,
+            agreement: agreement::Agreement::default(),
         }
+    }
+
+    /// What every agent's solver made of the graph.
+    pub fn agreement(&self) -> &agreement::Agreement {
+        &self.agreement
     }
 
     /// Takes an entry of any log; entries of one log come in order.
@@ -164,6 +172,7 @@ impl LoopCloser {
                 self.graph_changed = true;
             }
             Payload::OdometryEdge(_) => self.graph_changed = true,
+            Payload::SolveDigest(said) => self.agreement.on_digest(&key.agent, said),
             _ => {}
         }
     }

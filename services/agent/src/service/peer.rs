@@ -7,6 +7,7 @@ use coma_wire::v1::peer_server::Peer;
 use coma_wire::{At, PROTOCOL_MAJOR, PROTOCOL_MINOR, Wire, invalid, v1};
 use futures::Stream;
 use futures::stream;
+use prost::Message;
 use std::pin::Pin;
 use std::sync::Arc;
 use tonic::{Request, Response, Status};
@@ -74,6 +75,18 @@ impl Peer for PeerService {
         let heads = Some(knowledge.replica.heads().to_wire());
         messages.push(Ok(v1::PullEntriesResponse { entry: None, heads }));
         Ok(Response::new(Box::pin(stream::iter(messages))))
+    }
+
+    async fn fetch_result(
+        &self,
+        request: Request<v1::FetchResultRequest>,
+    ) -> Result<Response<v1::FetchResultResponse>, Status> {
+        let wanted = request.into_inner().generation;
+        let knowledge = self.0.lock();
+        let found = knowledge.own_results.iter().find(|c| c.generation == wanted);
+        let component =
+            found.ok_or_else(|| Status::not_found("this is not a newest result of this agent"))?;
+        Ok(Response::new(v1::FetchResultResponse { component: component.encode_to_vec().into() }))
     }
 
     async fn fetch_evidence(

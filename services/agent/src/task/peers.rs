@@ -7,6 +7,7 @@ use coma_runtime::{Class, channel};
 use coma_slam::log::{Entry, Evidence};
 use coma_wire::v1::peer_client::PeerClient;
 use coma_wire::{At, FieldError, Limited, PROTOCOL_MAJOR, PROTOCOL_MINOR, Wire, v1};
+use prost::Message;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -51,6 +52,19 @@ impl Peers {
             }
         }
         None
+    }
+
+    /// Fetches a result of another agent's solver, if it still has it.
+    pub async fn fetch_result(&self, author: &AgentId, generation: v1::Generation) -> Option<v1::Component> {
+        let mut client = self.clients.lock().unwrap_or_else(PoisonError::into_inner).get(author)?.clone();
+        let request = v1::FetchResultRequest { generation: Some(generation) };
+        match client.fetch_result(request).await {
+            Ok(response) => v1::Component::decode(response.into_inner().component).ok(),
+            Err(status) => {
+                debug!(%author, %status, "a peer did not serve its result");
+                None
+            }
+        }
     }
 
     fn put(&self, agent: AgentId, client: PeerClient<Channel>) {

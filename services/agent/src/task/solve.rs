@@ -2,10 +2,14 @@
 
 use crate::convert;
 use crate::node::{Node, Unfinished};
+use crate::task::peers::Peers;
+use coma_geometry::AgentId;
 use coma_runtime::Channel;
 use coma_slam::log::{Payload, SolveDigest, VersionVector};
+use coma_slam::loop_closure::corrections::Generation;
 use coma_wire::v1::dpgo_client::DpgoClient;
 use coma_wire::{At, Wire, v1};
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 use tracing::{debug, info, warn};
@@ -25,12 +29,13 @@ struct Given {
 }
 
 /// Solves after every change of the graph.
-pub async fn run(node: Arc<Node>, mut client: DpgoClient<Channel>) {
+pub async fn run(node: Arc<Node>, peers: Arc<Peers>, mut client: DpgoClient<Channel>) {
     let mut given = Given::default();
     loop {
         // Counted from before it is taken, so that a drain never sees neither.
         let unfinished = Unfinished::begin(&node);
         if !node.lock().closer.take_graph_changed() {
+            agree(&node, &peers).await;
             drop(unfinished);
             node.solve_wake.notified().await;
             continue;
@@ -58,6 +63,50 @@ pub async fn run(node: Arc<Node>, mut client: DpgoClient<Channel>) {
             given.have.clear();
             tokio::time::sleep(RETRY).await;
         }
+        agree(&node, &peers).await;
+    }
+}
+
+/// Where another agent's result of the same cut is to be taken instead of the own one, it is fetched and taken.
+async fn agree(node: &Node, peers: &Peers) {
+    let live: BTreeSet<AgentId> = node.live_agents().into_iter().collect();
+    let differing: Vec<(AgentId, Generation)> = {
+        let knowledge = node.lock();
+        let served = knowledge.corrections.components().iter().map(|c| &c.generation);
+        let agreement = knowledge.closer.agreement();
+        let instead = |served: &Generation| {
+            let (author, digest) =
+                agreement.instead_of(served, &knowledge.agent, |agent| live.contains(agent))?;
+            Some((author.clone(), Generation { digest, ..served.clone() }))
+        };
+        served.filter_map(instead).collect()
+    };
+    for (author, generation) in differing {
+        let message = convert::generation(&generation);
+        let Some(component) = peers.fetch_result(&author, message).await else { continue };
+        let correction = match convert::correction(component.clone(), &At::Root("component")) {
+            Ok(correction) if correction.generation == generation => correction,
+            Ok(_) => continue,
+            Err(e) => {
+                warn!(%author, error = %e, "a peer served a result that cannot be read");
+                continue;
+            }
+        };
+        let mut knowledge = node.lock();
+        // A newer solve may have come meanwhile.
+        let is_of = |c: &&mut v1::Component| {
+            c.generation.as_ref().is_some_and(|g| {
+                let wanted = component.generation.as_ref();
+                wanted.is_some_and(|wanted| g.map_id == wanted.map_id && g.cut == wanted.cut)
+            })
+        };
+        let Some(slot) = knowledge.solved.components.iter_mut().find(is_of) else { continue };
+        *slot = component.clone();
+        knowledge.corrections.adopt(correction);
+        drop(knowledge);
+        metrics::counter!("coma_agent_results_adopted_total").increment(1);
+        info!(map = %generation.map_id, %author, "another agent's result of the same cut was adopted");
+        node.publish(v1::watch_response::Event::Correction(component));
     }
 }
 
@@ -91,12 +140,12 @@ async fn solve(node: &Node, client: &mut DpgoClient<Channel>, given: &mut Given)
     let mut knowledge = node.lock();
     // Every agent says what its solver made of a cut, once, so that a difference is seen by all.
     let own = knowledge.agent.clone();
-    let before = knowledge.corrections.components().to_vec();
     let mut digests = Vec::new();
     for c in &corrections {
         let mine = c.map_from_submap.keys().any(|id| id.agent == own);
         let shared = c.map_from_submap.keys().any(|id| id.agent != own);
-        let known = before.iter().any(|b| b.generation == c.generation);
+        let generation = convert::generation(&c.generation);
+        let known = knowledge.own_results.iter().any(|b| b.generation.as_ref() == Some(&generation));
         if mine && shared && !known {
             let g = c.generation.clone();
             digests.push(SolveDigest { map_id: g.map_id, cut: g.cut, digest: g.digest });
@@ -109,6 +158,7 @@ async fn solve(node: &Node, client: &mut DpgoClient<Channel>, given: &mut Given)
         // Two agents may decide one pair: expected, and harmless.
         debug!(key = ?rejected.key, message = %rejected.message, "an entry is not used in the graph");
     }
+    knowledge.own_results.clone_from(&response.components);
     knowledge.solved = response.clone();
     for digest in digests {
         if let Err(e) = knowledge.write(&Payload::SolveDigest(digest)) {

@@ -2,7 +2,7 @@
 #![allow(dead_code, reason = "each test file uses its own part")]
 
 use coma_dpgo::{DpgoConfig, Handle, Server};
-use coma_geometry::{AgentId, Epoch, Matrix6, Pose, StampNs, SubmapId};
+use coma_geometry::{AgentId, Epoch, MapId, Matrix6, Pose, StampNs, SubmapId};
 use coma_runtime::{ByteLedger, Channel, Class, channel};
 use coma_wire::entries::*;
 use coma_wire::v1::dpgo_client::DpgoClient;
@@ -141,6 +141,6 @@ pub async fn solved(client: &mut Client, graph: &str, logs: &[&Log]) -> v1::Solv
 
 /// What a solver made of some cut.
 pub fn digest() -> SolveDigest {
-    let map_id = (AgentId::new("a").unwrap(), Epoch(1));
+    let map_id = MapId { agent: AgentId::new("a").unwrap(), epoch: Epoch(1), first_submap: 0 };
     SolveDigest { map_id, cut: VersionVector::new(), digest: [0; 32] }
 }

@@ -1,12 +1,11 @@
 //! What agents are asked. Every call has a deadline to its end, and a limit on what is taken.
 
 use super::link::{Link, plain};
-use crate::ask::map_text;
 use crate::cache::CachedSurfels;
 use crate::error::ApiError;
 use crate::json::{self, FramePose, Unreachable};
 use bytes::BytesMut;
-use coma_geometry::{AgentId, Epoch, Pose, SubmapId};
+use coma_geometry::{AgentId, MapId, Pose, SubmapId};
 use coma_wire::{At, FieldError, Wire, v1};
 use futures::{StreamExt, stream};
 use std::sync::Arc;
@@ -40,7 +39,7 @@ pub struct PlacedSubmap {
     /// Where it lies.
     pub map_from_submap: Pose,
     /// In which map.
-    pub map: (AgentId, Epoch),
+    pub map: MapId,
 }
 
 impl PlacedSubmap {
@@ -49,14 +48,14 @@ impl PlacedSubmap {
         let id: SubmapId = at.field("id").required(m.id)?;
         let agent_from_submap = at.field("agent_from_submap").required(m.agent_from_submap)?;
         let map_from_submap: Option<Pose> = at.field("map_from_submap").optional(m.map_from_submap)?;
-        let map = m.map_id.map(|map| coma_wire::map_id(map, &at.field("map_id"))).transpose()?;
+        let map: Option<MapId> = at.field("map_id").optional(m.map_id)?;
         Ok(PlacedSubmap {
             surfels: m.surfels,
             closed: m.closed,
             revision: m.revision,
             agent_from_submap,
             map_from_submap: map_from_submap.unwrap_or(agent_from_submap),
-            map: map.unwrap_or_else(|| (id.agent.clone(), id.epoch)),
+            map: map.unwrap_or_else(|| MapId { agent: id.agent.clone(), epoch: id.epoch, first_submap: 0 }),
             id,
         })
     }
@@ -71,7 +70,7 @@ impl PlacedSubmap {
             revision: self.revision,
             agent_from_submap: (&self.agent_from_submap).into(),
             map_from_submap: (&self.map_from_submap).into(),
-            map: map_text(&self.map),
+            map: self.map.to_string(),
         }
     }
 }

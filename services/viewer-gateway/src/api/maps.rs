@@ -2,7 +2,7 @@
 
 use super::Gateway;
 use super::graph::{Views, newest_components};
-use crate::ask::{Asked, map_id, map_text};
+use crate::ask::{Asked, map_id};
 use crate::error::{ApiError, Problem};
 use crate::json::{Pose, Unreachable};
 use crate::scene;
@@ -11,7 +11,7 @@ use axum::body::Bytes;
 use axum::extract::State;
 use axum::http::header;
 use axum::response::{IntoResponse, Response};
-use coma_geometry::{AgentId, Epoch, SubmapId};
+use coma_geometry::{MapId, SubmapId};
 use coma_surfel::{MergeSettings, Part, merge};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
@@ -30,7 +30,7 @@ pub struct Maps {
 /// One map.
 #[derive(Debug, Serialize, ToSchema)]
 pub struct Map {
-    /// `agent/epoch` of its gauge.
+    /// Its name: `agent/epoch` of its gauge, and `/s7` behind it where a later part of a run is a map of its own.
     pub id: String,
     /// Agents with a submap in it.
     pub agents: BTreeSet<String>,
@@ -45,9 +45,9 @@ pub struct Map {
     responses((status = 200, description = "The maps", body = Maps)))]
 pub async fn maps(State(gateway): State<Arc<Gateway>>) -> Json<Maps> {
     let (submaps, unreachable) = scene::submaps(&gateway.directory).await;
-    let mut maps: BTreeMap<(AgentId, Epoch), Map> = BTreeMap::new();
+    let mut maps: BTreeMap<MapId, Map> = BTreeMap::new();
     for submap in &submaps {
-        let empty = || Map { id: map_text(&submap.map), agents: BTreeSet::new(), submaps: 0, surfels: 0 };
+        let empty = || Map { id: submap.map.to_string(), agents: BTreeSet::new(), submaps: 0, surfels: 0 };
         let map = maps.entry(submap.map.clone()).or_insert_with(empty);
         map.agents.insert(submap.id.agent.to_string());
         map.submaps += 1;
@@ -92,7 +92,7 @@ pub async fn ply(
     let headers = [
         (header::CONTENT_TYPE.as_str(), "application/octet-stream".to_owned()),
         (header::CONTENT_DISPOSITION.as_str(), "attachment; filename=\"map.ply\"".to_owned()),
-        ("x-coma-map", map_text(&scene.map)),
+        ("x-coma-map", scene.map.to_string()),
         ("x-coma-unreachable", scene.unreachable.len().to_string()),
     ];
     Ok((headers, file).into_response())
@@ -137,10 +137,8 @@ pub async fn relation(
         Ok(pose) => (Some((&pose).into()), None),
         Err(reason) => (None, Some(reason)),
     };
-    Ok(Json(Relation { old: map_text(&old), new: map_text(&new), new_map_from_old_map: pose, reason }))
+    Ok(Json(Relation { old: old.to_string(), new: new.to_string(), new_map_from_old_map: pose, reason }))
 }
-
-type MapId = (AgentId, Epoch);
 
 /// `new_map_from_old_map`, or why there is none.
 fn relate(
@@ -151,44 +149,44 @@ fn relate(
     if old == new {
         return Ok(coma_geometry::Pose::identity());
     }
-    let gauge = |map: &MapId| SubmapId { agent: map.0.clone(), epoch: map.1, number: 0 };
-    let both = components.iter().find_map(|poses| Some((poses.get(&gauge(old))?, poses.get(&gauge(new))?)));
+    let both = components.iter().find_map(|poses| Some((poses.get(&old.gauge())?, poses.get(&new.gauge())?)));
     if let Some((map_from_old, map_from_new)) = both {
         return Ok(map_from_new.inv_mul(map_from_old));
     }
     for map in [old, new] {
-        if !components.iter().any(|poses| poses.contains_key(&gauge(map))) {
-            return Err(format!("no result of the graph has the first submap of {}", map_text(map)));
+        if !components.iter().any(|poses| poses.contains_key(&map.gauge())) {
+            return Err(format!("no result of the graph has the first submap of {map}"));
         }
     }
-    Err(format!(
-        "{} and {} are not joined: no accepted loops tie them together",
-        map_text(old),
-        map_text(new)
-    ))
+    Err(format!("{old} and {new} are not joined: no accepted loops tie them together"))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use coma_geometry::{Tangent, se3};
+    use coma_geometry::{AgentId, Epoch, Tangent, se3};
 
     #[test]
     fn maps_of_one_component_are_related_by_their_first_submaps() {
-        let map = |name: &str| (AgentId::new(name).unwrap(), Epoch(1));
         let first = |name: &str| SubmapId { agent: AgentId::new(name).unwrap(), epoch: Epoch(1), number: 0 };
+        let map = |name: &str| MapId::of(&first(name));
         let map_from_b = se3::exp(&Tangent::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3));
         let map_from_c = se3::exp(&Tangent::new(-1.0, 0.5, 0.0, 0.4, 0.0, 0.3));
-        let joined = BTreeMap::from([
+        let mut joined = BTreeMap::from([
             (first("a"), coma_geometry::Pose::identity()),
             (first("b"), map_from_b),
             (first("c"), map_from_c),
         ]);
         let alone = BTreeMap::from([(first("d"), coma_geometry::Pose::identity())]);
+        // A part of d's run that lost contact with its beginning, and met b.
+        let part = SubmapId { number: 7, ..first("d") };
+        let map_from_part = se3::exp(&Tangent::new(0.0, 0.5, 2.0, 0.0, 0.3, 0.0));
+        joined.insert(part.clone(), map_from_part);
         let components = [joined, alone];
         let near = |a: coma_geometry::Pose, b| se3::distance(&a, &b).0 < 1e-12;
         assert!(near(relate(&components, &map("b"), &map("a")).unwrap(), map_from_b));
         assert!(near(relate(&components, &map("b"), &map("c")).unwrap(), map_from_c.inv_mul(&map_from_b)));
+        assert!(near(relate(&components, &MapId::of(&part), &map("a")).unwrap(), map_from_part));
         assert!(relate(&components, &map("d"), &map("a")).unwrap_err().contains("not joined"));
         assert!(relate(&components, &map("x"), &map("a")).unwrap_err().contains("x/1"));
         assert!(near(relate(&[], &map("x"), &map("x")).unwrap(), coma_geometry::Pose::identity()));

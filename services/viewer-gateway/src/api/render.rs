@@ -1,7 +1,7 @@
 //! The map as seen from any viewpoint.
 
 use super::Gateway;
-use crate::ask::{Asked, Json, map_id, map_text};
+use crate::ask::{Asked, Json, map_id};
 use crate::error::{ApiError, Problem};
 use crate::json::Pose;
 use crate::render::{Format, Output, picture};
@@ -181,7 +181,7 @@ async fn render(
     let headers = [
         (header::CONTENT_TYPE.as_str(), format.media_type().to_owned()),
         (header::CACHE_CONTROL.as_str(), "no-store".to_owned()),
-        ("x-coma-map", map_text(&scene.map)),
+        ("x-coma-map", scene.map.to_string()),
     ];
     Ok((headers, file).into_response())
 }
