@@ -45,7 +45,7 @@ fn coarse_map() -> SurfelCloud {
 }
 
 fn settings(steps: u32) -> RefineSettings {
-    RefineSettings { steps, grow_every: 15, poses_from_step: 10, ..RefineSettings::default() }
+    RefineSettings { steps, grow_every: 15, poses: true, poses_from_step: 10, ..RefineSettings::default() }
 }
 
 fn take(job: &mut Refiner, steps: u32) -> Vec<Step> {
@@ -117,7 +117,8 @@ fn fixed_surfels_are_rendered_and_stay_as_they_are() {
     let mut job = with();
     let steps = take(&mut job, 30);
     assert_eq!(job.fixed, fixed);
-    let mut alone = Refiner::new(settings(30), own.iter().copied().collect(), SurfelCloud::default(), poses());
+    let mut alone =
+        Refiner::new(settings(30), own.iter().copied().collect(), SurfelCloud::default(), poses());
     let without = take(&mut alone, 1);
     assert!(steps[0].psnr_db > without[0].psnr_db + 3.0, "{steps:?}\n{without:?}");
     // What the fixed ones show grows no surfels of its own.
