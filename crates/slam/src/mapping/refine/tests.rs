@@ -16,7 +16,7 @@ fn frame(map_from_camera: &Pose) -> RgbdFrame {
     let color = Image::from_fn(48, 36, |x, y| {
         let p = at(x, y).1;
         let wave = |f: f64| ((0.5 + 0.3 * (f * p.x).sin() * (0.8 * f * p.y).cos()) * 255.0) as u8;
-        [wave(9.0), wave(17.0), wave(31.0)]
+        [wave(4.0), wave(8.0), wave(12.0)]
     });
     let depth_m = Image::from_fn(48, 36, |x, y| at(x, y).0 as f32);
     RgbdFrame::new(0, StampNs(0), camera, DepthNoise::default(), color, depth_m).unwrap()
