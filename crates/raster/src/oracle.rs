@@ -115,7 +115,8 @@ fn pixel(
         if passing > 0.5 && after <= 0.5 {
             out.median = depth;
         }
-        let together = (depth * surface - surface_sum).abs() <= settings.surface_relative as f64 * depth * surface;
+        let together =
+            (depth * surface - surface_sum).abs() <= settings.surface_relative as f64 * depth * surface;
         if together {
             (surface, surface_sum) = (surface + alpha, surface_sum + alpha * depth);
         } else if surface < alpha {

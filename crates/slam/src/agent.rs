@@ -196,7 +196,7 @@ impl Agent {
 
     /// The first half of [`Agent::on_frame`]: where is the camera? Changes nothing.
     pub fn locate(&self, frame: &RgbdFrame) -> Located {
-        let levels = self.settings.tracking.frame_to_frame.steps.len();
+        let levels = self.settings.tracking.levels();
         let share = frame.depth_coverage();
         if !(share >= self.settings.tracking.min_depth_share) {
             let needed = self.settings.tracking.min_depth_share * 100.0;

@@ -78,7 +78,9 @@ pub fn fuse(
         let sigma = view.noise.sigma_m(z);
         let off = own.dot(&(ray * z - p));
         let off_z = off / along.abs().max(0.1);
-        if !(off_z.abs() <= settings.gate_sigma * (*variance + sigma * sigma).sqrt() + settings.gate_relative * z) {
+        if !(off_z.abs()
+            <= settings.gate_sigma * (*variance + sigma * sigma).sqrt() + settings.gate_relative * z)
+        {
             return;
         }
         let least = sigma * sigma / settings.most_frames;

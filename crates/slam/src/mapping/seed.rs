@@ -1,7 +1,7 @@
 //! New surfels from pixels: surface-fitting initialisation (eq. 6 to 8 of the CoMA-SLAM paper).
 
 use coma_frame::{Image, RgbdFrame, normals};
-use coma_geometry::Pose;
+use coma_geometry::{Intrinsics, Pose};
 use coma_surfel::Surfel;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
@@ -28,25 +28,65 @@ impl Default for SeedSettings {
     }
 }
 
+/// The pixels that may become surfels: every n-th in both directions.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SeedGrid {
+    /// Pixel `(i, j)` of this camera is the frame's `(first + spacing * i, first + spacing * j)`.
+    pub camera: Intrinsics,
+    spacing: usize,
+    first: usize,
+}
+
+impl SeedGrid {
+    /// Of a frame's camera.
+    pub fn of(camera: &Intrinsics, settings: &SeedSettings) -> Self {
+        let spacing = settings.spacing_px.max(1);
+        let (first, factor) = (spacing / 2, 1.0 / spacing as f64);
+        let count = |length: u32| (length as usize).saturating_sub(first).div_ceil(spacing) as u32;
+        let camera = Intrinsics {
+            width: count(camera.width),
+            height: count(camera.height),
+            fx: camera.fx * factor,
+            fy: camera.fy * factor,
+            cx: (camera.cx - first as f64) * factor,
+            cy: (camera.cy - first as f64) * factor,
+        };
+        SeedGrid { camera, spacing, first }
+    }
+
+    /// The frame's pixel at `(i, j)` of the grid.
+    pub fn pixel(&self, i: usize, j: usize) -> (usize, usize) {
+        (self.first + self.spacing * i, self.first + self.spacing * j)
+    }
+
+    /// An image's values on the grid.
+    pub fn pick<T: Copy>(&self, image: &Image<T>) -> Image<T> {
+        Image::from_fn(self.camera.width as usize, self.camera.height as usize, |i, j| {
+            image[self.pixel(i, j)]
+        })
+    }
+}
+
 /// Surfels for the pixels of the seed grid at which `wanted` holds, in the submap's frame. Pixels without
 /// depth or normal (a depth jump) make none.
 pub fn seed(
     frame: &RgbdFrame,
     submap_from_camera: &Pose,
     settings: &SeedSettings,
-    wanted: impl Fn(usize, usize) -> bool,
+    grid: &SeedGrid,
+    wanted: &Image<bool>,
     color_at: impl Fn(usize, usize) -> [f32; 3],
 ) -> Vec<Surfel> {
     let normal = normals::normals_from_depth(&frame.depth_m, &frame.camera, 0.05, 2);
-    let spacing = settings.spacing_px.max(1);
     let rotation = submap_from_camera.rotation.to_rotation_matrix().matrix().cast::<f32>();
     let translation: Vector3<f32> = submap_from_camera.translation.vector.cast();
     let mut out = Vec::new();
-    for y in (spacing / 2..frame.depth_m.height()).step_by(spacing) {
-        for x in (spacing / 2..frame.depth_m.width()).step_by(spacing) {
-            if !wanted(x, y) {
+    for j in 0..wanted.height() {
+        for i in 0..wanted.width() {
+            if !wanted[(i, j)] {
                 continue;
             }
+            let (x, y) = grid.pixel(i, j);
             let Some((center, axes, scale)) = disc(frame, &normal, x, y, settings) else { continue };
             let submap_axes = Rotation3::from_matrix_unchecked(rotation * axes);
             let q = UnitQuaternion::from_rotation_matrix(&submap_axes);
@@ -93,7 +133,7 @@ fn disc(
 mod tests {
     use super::*;
     use coma_frame::DepthNoise;
-    use coma_geometry::{Intrinsics, StampNs};
+    use coma_geometry::StampNs;
 
     fn wall() -> RgbdFrame {
         let camera = Intrinsics { width: 32, height: 24, fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5 };
@@ -106,7 +146,10 @@ mod tests {
     fn surfels_lie_on_the_surface_and_face_the_camera() {
         let frame = wall();
         let pose = Pose::translation(1.0, 0.0, 0.0);
-        let surfels = seed(&frame, &pose, &SeedSettings::default(), |_, _| true, |_, _| [1.0, 0.5, 0.2]);
+        let settings = SeedSettings::default();
+        let grid = SeedGrid::of(&frame.camera, &settings);
+        let all = Image::filled(16, 12, true);
+        let surfels = seed(&frame, &pose, &settings, &grid, &all, |_, _| [1.0, 0.5, 0.2]);
         assert!(surfels.len() > 80);
         for s in &surfels {
             assert!((s.center_m[2] - 2.0).abs() < 1e-5);
@@ -120,7 +163,28 @@ mod tests {
     fn scales_follow_equation_6() {
         let settings =
             SeedSettings { spacing_px: 1, scale_in_spacings: 1.0, max_stretch: 1.0, ..Default::default() };
-        let surfels = seed(&wall(), &Pose::identity(), &settings, |x, y| (x, y) == (15, 11), |_, _| [0.0; 3]);
+        let frame = wall();
+        let grid = SeedGrid::of(&frame.camera, &settings);
+        let one = Image::from_fn(32, 24, |x, y| (x, y) == (15, 11));
+        let surfels = seed(&frame, &Pose::identity(), &settings, &grid, &one, |_, _| [0.0; 3]);
+        assert_eq!(surfels.len(), 1);
         assert!((surfels[0].scale_m[0] - 2.0 / 30.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn the_grid_s_rays_are_those_of_its_pixels() {
+        let camera = Intrinsics { width: 33, height: 24, fx: 30.0, fy: 31.0, cx: 15.2, cy: 11.5 };
+        for spacing_px in [1, 2, 3] {
+            let grid = SeedGrid::of(&camera, &SeedSettings { spacing_px, ..Default::default() });
+            let last = (grid.camera.width as usize - 1, grid.camera.height as usize - 1);
+            for (i, j) in [(0, 0), (3, 5), last] {
+                let (x, y) = grid.pixel(i, j);
+                assert!(x < 33 && y < 24);
+                assert!(
+                    (grid.camera.ray(i as f64, j as f64) - camera.ray(x as f64, y as f64)).norm() < 1e-12
+                );
+            }
+            assert!(grid.pixel(last.0 + 1, 0).0 >= 33 && grid.pixel(0, last.1 + 1).1 >= 24);
+        }
     }
 }

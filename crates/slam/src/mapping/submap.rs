@@ -3,12 +3,12 @@
 use super::fuse::{FuseSettings, fuse};
 use super::inherit::{InheritSettings, Inheritance, inherit};
 use super::optimise::{Adam, Loss, OptimiseSettings, Target, optimise_once};
-use super::seed::{SeedSettings, seed};
+use super::seed::{SeedGrid, SeedSettings, seed};
 use crate::tracking::align::Brightness;
 use crate::tracking::view::TrackingView;
 use coma_frame::{Image, RgbdFrame};
 use coma_geometry::{Pose, SubmapId, se3};
-use coma_raster::{GrowthTest, RenderSettings, SubmapView};
+use coma_raster::{GrowthTest, Outputs, RenderSettings, SubmapView};
 use coma_surfel::SurfelCloud;
 use nalgebra::Point3;
 use serde::{Deserialize, Serialize};
@@ -88,6 +88,9 @@ pub struct ActiveSubmap {
     moving_frames: u32,
     last_counted: Pose,
     next_keyframe: usize,
+    steps_taken: u32,
+    /// Optimiser steps that are due until the next keyframe.
+    owed_steps: u32,
 }
 
 /// What a frame did to the submap.
@@ -122,6 +125,8 @@ impl ActiveSubmap {
             moving_frames: 0,
             last_counted: Pose::identity(),
             next_keyframe: 0,
+            steps_taken: 0,
+            owed_steps: 0,
         }
     }
 
@@ -149,23 +154,30 @@ impl ActiveSubmap {
         if settings.fuse.enabled {
             fuse(&mut self.surfels, &mut self.variance_m2, view, &camera_from_submap, &settings.fuse);
         }
+        // At the resolution of the seeds: one look at each pixel that may become a surfel.
+        let grid = SeedGrid::of(&frame.camera, &settings.seed);
+        let depth_m = grid.pick(&frame.depth_m);
         let views = [SubmapView { surfels: &self.surfels, camera_from_submap }];
         let test = GrowthTest {
-            observed_depth_m: &frame.depth_m,
+            observed_depth_m: &depth_m,
             noise: frame.noise,
             sigma_factor: settings.growth_sigma,
             relative: settings.growth_relative,
         };
-        let rendering = coma_raster::render(&views, &frame.camera, render_settings, Some(&test));
+        let shrunk = (grid.camera.fx / frame.camera.fx) as f32;
+        let coarse = RenderSettings { low_pass_px: render_settings.low_pass_px * shrunk, ..*render_settings };
+        let rendering =
+            coma_raster::render_only(&views, &grid.camera, &coarse, Some(&test), Outputs::OPTIMISING);
         out.hits += rendering.hits;
         // Eq. 5: no surfel near the observed depth, or the pixel is not covered.
-        let is_new = |x: usize, y: usize| {
+        let wanted = Image::from_fn(depth_m.width(), depth_m.height(), |x, y| {
             let known = rendering.near_surface.as_ref().is_some_and(|near| near[(x, y)]);
             !known || rendering.opacity[(x, y)] < settings.covered_opacity
-        };
-        let new_surfels = seed(frame, submap_from_camera, &settings.seed, is_new, |x, y| color[(x, y)]);
+        });
+        let new_surfels =
+            seed(frame, submap_from_camera, &settings.seed, &grid, &wanted, |x, y| color[(x, y)]);
         out.added = new_surfels.len();
-        out.new_share = new_share(&frame.depth_m, is_new);
+        out.new_share = new_share(&depth_m, &wanted);
         for surfel in new_surfels {
             let depth_m = (camera_from_submap * Point3::from(surfel.center_m).cast::<f64>()).z as f32;
             let sigma = frame.noise.sigma_m(depth_m);
@@ -188,8 +200,14 @@ impl ActiveSubmap {
         self.mapped_frames += 1;
         if due || urgent {
             self.add_keyframe(frame, color, submap_from_camera);
-            self.optimise(step_budget, settings, render_settings, &mut out);
+            self.owed_steps += settings.steps_per_keyframe;
         }
+        // Spread over the frames until the next keyframe, so that no frame takes much longer than the others.
+        let every = settings.keyframe_every.max(1);
+        let left = every - (self.mapped_frames - 1) % every;
+        let steps = self.owed_steps.div_ceil(left).min(step_budget);
+        self.owed_steps -= steps;
+        self.optimise(steps, settings, render_settings, &mut out);
         if out.added > 0 || out.steps > 0 {
             self.revision += 1;
         }
@@ -215,16 +233,18 @@ impl ActiveSubmap {
 
     fn optimise(
         &mut self,
-        step_budget: u32,
+        steps: u32,
         settings: &MappingSettings,
         render_settings: &RenderSettings,
         out: &mut MappedFrame,
     ) {
         let count = self.keyframes.len();
-        for step in 0..settings.steps_per_keyframe.min(step_budget) {
+        for _ in 0..steps {
             // Every other step on the newest keyframe, the rest in turn.
-            let pick = if step % 2 == 0 { count - 1 } else { self.next_keyframe % count };
-            self.next_keyframe += (step % 2) as usize;
+            let newest = self.steps_taken.is_multiple_of(2);
+            self.steps_taken = self.steps_taken.wrapping_add(1);
+            let pick = if newest { count - 1 } else { self.next_keyframe % count };
+            self.next_keyframe += !newest as usize;
             let target = &self.keyframes[pick];
             let (loss, hits) =
                 optimise_once(&mut self.surfels, &mut self.adam, target, render_settings, &settings.optimise);
@@ -261,15 +281,11 @@ pub fn corrected_color(color: &Image<[u8; 3]>, brightness: Brightness) -> Image<
     color.map(|c| c.map(|v| table[v as usize]))
 }
 
-fn new_share(depth_m: &Image<f32>, is_new: impl Fn(usize, usize) -> bool) -> f32 {
+fn new_share(depth_m: &Image<f32>, wanted: &Image<bool>) -> f32 {
     let (mut seen, mut new) = (0u32, 0u32);
-    for y in (0..depth_m.height()).step_by(4) {
-        for x in (0..depth_m.width()).step_by(4) {
-            if depth_m[(x, y)] > 0.0 {
-                seen += 1;
-                new += is_new(x, y) as u32;
-            }
-        }
+    for (_, wanted) in depth_m.pixels().iter().zip(wanted.pixels()).filter(|(z, _)| **z > 0.0) {
+        seen += 1;
+        new += *wanted as u32;
     }
     new as f32 / seen.max(1) as f32
 }

@@ -14,6 +14,9 @@ use view::TrackingView;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrackingSettings {
+    /// Pictures are aligned at this resolution: 0 is the frame's own, 1 half of it, and coarser ones before. Half is as
+    /// exact as the whole, as depth and colour of four pixels are averaged, at a quarter of the cost.
+    pub finest_level: usize,
     /// Frame against the frame before.
     pub frame_to_frame: AlignSettings,
     /// Frame against the rendered submaps.
@@ -42,13 +45,21 @@ pub struct TrackingSettings {
     pub floor_rad: f64,
 }
 
+impl TrackingSettings {
+    /// Resolutions that a frame's view needs.
+    pub fn levels(&self) -> usize {
+        self.finest_level + self.frame_to_frame.steps.len().max(self.frame_to_model.steps.len())
+    }
+}
+
 impl Default for TrackingSettings {
     fn default() -> Self {
         TrackingSettings {
+            finest_level: 1,
             frame_to_frame: AlignSettings::default(),
             frame_to_model: AlignSettings {
-                steps: vec![4, 5, 5],
-                max_distance_m: 0.02,
+                steps: vec![4, 8],
+                max_distance_m: 0.04,
                 prior_m: 0.02,
                 prior_rad: 0.02,
                 ..AlignSettings::default()
@@ -139,6 +150,7 @@ pub fn frame_to_frame(
     last_motion: &Pose,
     settings: &TrackingSettings,
 ) -> Option<Alignment> {
+    let (previous, view) = (&previous.coarser(settings.finest_level), &view.coarser(settings.finest_level));
     let with_velocity = align(previous, view, last_motion, Brightness::default(), &settings.frame_to_frame);
     match with_velocity {
         Some(found) if found.inlier_share() > settings.map_at_once_share => Some(found),
@@ -158,12 +170,14 @@ pub fn frame_to_model(
     brightness: Brightness,
     settings: &TrackingSettings,
 ) -> Result<Tracked, Vec<Reason>> {
+    let full = view.levels[0].camera;
+    let view = &view.coarser(settings.finest_level);
     let mut pose = *guess_agent_from_camera;
     let mut brightness = brightness;
     let mut hits = 0;
     let mut last = None;
     for _ in 0..settings.model_rounds.max(1) {
-        let picture = model.picture(&pose, &view.levels[0].camera, view, settings);
+        let picture = model.picture(&pose, &view.levels[0].camera, &full, view, settings);
         hits += picture.hits;
         let Some(found) = align(&picture.view, view, &Pose::identity(), brightness, &settings.frame_to_model)
         else {

@@ -4,7 +4,7 @@ use super::TrackingSettings;
 use super::view::TrackingView;
 use coma_frame::Image;
 use coma_geometry::{Intrinsics, Pose};
-use coma_raster::{RenderSettings, Rendering, SubmapView};
+use coma_raster::{Outputs, RenderSettings, Rendering, SubmapView};
 use coma_surfel::SurfelCloud;
 
 /// The submaps that are tracked against, in the agent's frame.
@@ -24,11 +24,12 @@ pub struct ModelPicture {
 }
 
 impl Model<'_> {
-    /// Renders the model for a camera at `agent_from_camera`.
+    /// Renders the model for a camera at `agent_from_camera`; `full` is the same at the sensor's own resolution.
     pub fn picture(
         &self,
         agent_from_camera: &Pose,
         camera: &Intrinsics,
+        full: &Intrinsics,
         like: &TrackingView,
         settings: &TrackingSettings,
     ) -> ModelPicture {
@@ -41,7 +42,10 @@ impl Model<'_> {
                 camera_from_submap: camera_from_agent * agent_from_submap,
             })
             .collect();
-        let rendering = coma_raster::render(&views, camera, self.render, None);
+        // The same low-pass in the frame's pixels, at whatever resolution.
+        let shrunk = camera.fx / full.fx;
+        let render = RenderSettings { low_pass_px: self.render.low_pass_px * shrunk as f32, ..*self.render };
+        let rendering = coma_raster::render_only(&views, camera, &render, None, Outputs::TRACKING);
         let depth_m = trusted_depth(&rendering, settings);
         let intensity = rendering.color.map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]);
         let view = TrackingView::build(*camera, depth_m, intensity, like.noise, like.levels.len());

@@ -3,6 +3,7 @@
 use coma_frame::{DepthNoise, Image, RgbdFrame, normals, pyramid};
 use coma_geometry::Intrinsics;
 use rayon::prelude::*;
+use std::sync::Arc;
 
 /// Relative depth difference beyond which two neighbours lie on different surfaces.
 pub const DEPTH_JUMP: f32 = 0.05;
@@ -30,7 +31,7 @@ pub struct Level {
 #[derive(Clone, Debug)]
 pub struct TrackingView {
     /// From fine to coarse.
-    pub levels: Vec<Level>,
+    pub levels: Vec<Arc<Level>>,
     /// How wrong its depth is.
     pub noise: DepthNoise,
 }
@@ -66,9 +67,16 @@ impl TrackingView {
             let margin = if level == 0 { JUMP_MARGIN_PX } else { 1 };
             let trusted = away_from_jumps(&depth_m, jump, margin);
             let gradient = central_gradient(&intensity);
-            out.push(Level { camera, depth_m: trusted, normal, intensity: intensity.clone(), gradient });
+            let intensity = intensity.clone();
+            out.push(Arc::new(Level { camera, depth_m: trusted, normal, intensity, gradient }));
         }
         TrackingView { levels: out, noise }
+    }
+
+    /// The same without its `levels` finest resolutions; the coarsest always stays.
+    pub fn coarser(&self, levels: usize) -> TrackingView {
+        let first = levels.min(self.levels.len().saturating_sub(1));
+        TrackingView { levels: self.levels[first..].to_vec(), noise: self.noise }
     }
 }
 
