@@ -110,7 +110,7 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     let right = format!("right=tum:{}/agent-0[6:18]", path("right"));
     succeeds(&["run", &left, &right, "--hold-out", "4", "--out", &run]);
     let base = std::fs::read(folder.path().join("run/map.ply")).unwrap();
-    let steps = ["--steps", "40", "--checkpoint-every", "5"];
+    let steps = ["--steps", "60", "--checkpoint-every", "5", "--poses"];
     let refine = |more: &[&str]| [&["refine", &run][..], &steps[..], more].concat();
     let refined = |name: &str| folder.path().join("run/refined").join(name);
 

@@ -9,11 +9,11 @@ use crate::run::{faults, trajectory_name, write_atomically};
 use crate::source::{self, Source};
 use anyhow::Context;
 use clap::Args;
+use coma_dataset::Sequence;
 use coma_evaluation::{
     AgentSummary, EdgeErrors, LoopCounts, LoopLine, MapSize, NormalisedErrors, Plots, Report, RunInfo,
     RunTrajectories, StageTime, Times, Track, Traffic,
 };
-use coma_dataset::Sequence;
 use coma_geometry::{AgentId, Pose, StampNs, tum};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

@@ -26,8 +26,9 @@ pub fn score(read: &Read, out: &Path, options: &Options) -> anyhow::Result<(Pict
         Some(path) => Some(coma_encoder::Perceptual::open(path, &coma_encoder::RuntimeSettings::default())?),
         None => None,
     };
-    let maps: Vec<Maps> =
-        (0..read.facts.components.len()).map(|c| Maps::read(out, &read.facts, c)).collect::<Result<_, _>>()?;
+    let maps: Vec<Maps> = (0..read.facts.components.len())
+        .map(|c| Maps::read(out, &read.facts, c))
+        .collect::<Result<_, _>>()?;
     let plan = plan(read, options.views);
     let bar = progress::steps("rendering", plan.len() as u64);
     let renders = out.join("renders");

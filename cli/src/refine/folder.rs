@@ -108,11 +108,14 @@ impl Files {
         if !path.exists() {
             return Ok(None);
         }
-        let facts: RefinedFacts = serde_json::from_slice(&read_bounded(&path)?)
-            .with_context(|| path.display().to_string())?;
+        let facts: RefinedFacts =
+            serde_json::from_slice(&read_bounded(&path)?).with_context(|| path.display().to_string())?;
         let of = &run.components[component];
         if (&facts.component, &facts.digest, facts.base_surfels) != (&of.name, &of.digest, of.surfels) {
-            bail!("{}: was refined from another map than the run's; remove it, or refine again", path.display());
+            bail!(
+                "{}: was refined from another map than the run's; remove it, or refine again",
+                path.display()
+            );
         }
         Ok(Some((read_map(&self.map())?, facts)))
     }
@@ -131,7 +134,8 @@ pub struct Refined {
 /// The refined map of a component: the whole one, or what agents refined each for itself, and the run's own surfels
 /// for the other agents. `None` where nothing was refined.
 pub fn read(run: &Path, facts: &Facts, component: usize) -> anyhow::Result<Option<Refined>> {
-    let by_frame = |facts: RefinedFacts| facts.poses.into_iter().map(|p| ((p.agent, p.frame), p.map_from_camera));
+    let by_frame =
+        |facts: RefinedFacts| facts.poses.into_iter().map(|p| ((p.agent, p.frame), p.map_from_camera));
     if let Some((map, refined)) = Files::new(run, component, None).read(facts, component)? {
         let render = refined.settings.render();
         return Ok(Some(Refined { map, render, poses: by_frame(refined).collect() }));
@@ -161,14 +165,19 @@ pub fn read(run: &Path, facts: &Facts, component: usize) -> anyhow::Result<Optio
 }
 
 /// Whose surfels a component's map holds, agent by agent in the order of the map.
-pub fn owners(facts: &Facts, component: usize, map: &SurfelCloud) -> anyhow::Result<Vec<(String, Range<usize>)>> {
+pub fn owners(
+    facts: &Facts,
+    component: usize,
+    map: &SurfelCloud,
+) -> anyhow::Result<Vec<(String, Range<usize>)>> {
     let mut submaps: Vec<&SubmapFacts> =
         facts.agents.iter().flat_map(|a| &a.submaps).filter(|s| s.component == Some(component)).collect();
     submaps.sort_by(|a, b| a.id.cmp(&b.id));
     let mut out: Vec<(String, Range<usize>)> = Vec::new();
     let mut end = 0;
     for submap in submaps {
-        let count = submap.merged_surfels.context("run.json does not say whose surfels are whose: run anew")?;
+        let count =
+            submap.merged_surfels.context("run.json does not say whose surfels are whose: run anew")?;
         let agent = submap.id.agent.to_string();
         match out.last_mut().filter(|(last, _)| *last == agent) {
             Some((_, range)) => range.end += count,

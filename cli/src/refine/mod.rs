@@ -39,6 +39,10 @@ pub struct Arguments {
     /// Cameras choose their exposure: each picture is first brought to the map's brightness.
     #[arg(long)]
     exposure: bool,
+    /// Aligns each view with the map when it is visited, for cameras that were tracked worse than the map shows detail.
+    /// Held-out views take the corrections of their neighbours.
+    #[arg(long)]
+    poses: bool,
     /// Which of the run's maps, where agents did not all merge; the first has most frames.
     #[arg(long, default_value_t = 0)]
     component: usize,
@@ -58,6 +62,7 @@ pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
     let mut settings: RefineSettings = coma_runtime::load(arguments.config.as_deref(), "COMA_REFINE")?;
     settings.steps = arguments.steps.unwrap_or(settings.steps);
     settings.exposure |= arguments.exposure;
+    settings.poses |= arguments.poses;
     tokio::task::spawn_blocking(move || {
         let mut pool = rayon::ThreadPoolBuilder::new();
         if let Some(threads) = arguments.threads {

@@ -50,7 +50,13 @@ impl Adam {
     }
 
     /// One step with rates times `decay`. Surfels without any gradient (not seen) stay as they are.
-    pub fn step(&mut self, surfels: &mut SurfelCloud, gradients: &SurfelGradients, settings: &RefineSettings, decay: f32) {
+    pub fn step(
+        &mut self,
+        surfels: &mut SurfelCloud,
+        gradients: &SurfelGradients,
+        settings: &RefineSettings,
+        decay: f32,
+    ) {
         let optimise = &settings.optimise;
         let rates: [f32; PARAMETERS] = std::array::from_fn(|k| {
             decay

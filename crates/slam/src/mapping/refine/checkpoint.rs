@@ -50,7 +50,9 @@ pub(super) fn fingerprint(
 }
 
 pub(super) fn write(job: &Refiner) -> Vec<u8> {
-    let mut out = Vec::with_capacity(MARK.len() + 2 * HASH + COUNTS + job.surfels.len() * SURFEL + job.poses.len() * POSE);
+    let mut out = Vec::with_capacity(
+        MARK.len() + 2 * HASH + COUNTS + job.surfels.len() * SURFEL + job.poses.len() * POSE,
+    );
     out.extend_from_slice(MARK);
     out.extend_from_slice(&job.fingerprint);
     for count in [job.step, job.surfels.len() as u32, job.poses.len() as u32] {
@@ -87,7 +89,8 @@ pub(super) fn read(job: &mut Refiner, bytes: &[u8]) -> Result<(), CheckpointErro
     }
     let mut from = Reader(&body[MARK.len() + HASH..]);
     let [step, surfels, views] = [from.u32(), from.u32(), from.u32()];
-    if from.0.len() != surfels as usize * SURFEL + views as usize * POSE || views as usize != job.poses.len() {
+    if from.0.len() != surfels as usize * SURFEL + views as usize * POSE || views as usize != job.poses.len()
+    {
         return Err(CheckpointError::Torn);
     }
     let (mut cloud, mut adam, mut seen) = (SurfelCloud::default(), Adam::default(), Vec::new());

@@ -99,8 +99,12 @@ fn chosen(surfels: &SurfelCloud, seen: &[Seen], settings: &RefineSettings) -> Ve
     // Both kinds of error in units of what is let pass.
     let error = |s: &Seen| (s.color / settings.split_color).max(s.depth_m / settings.split_depth_m);
     let halved = |s: &Seen| s.px.map(|px| error(s) > s.weight && px > settings.split_px);
-    let mut asking: Vec<(f32, usize)> =
-        seen.iter().enumerate().filter(|(_, s)| halved(s) != [false; 2]).map(|(i, s)| (error(s), i)).collect();
+    let mut asking: Vec<(f32, usize)> = seen
+        .iter()
+        .enumerate()
+        .filter(|(_, s)| halved(s) != [false; 2])
+        .map(|(i, s)| (error(s), i))
+        .collect();
     asking.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
     let most = (settings.split_share * surfels.len() as f32).ceil() as usize;
     // One becomes four at most.

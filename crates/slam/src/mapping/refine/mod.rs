@@ -135,19 +135,27 @@ impl Refiner {
         };
         let views = self.views(view);
         let gradients = coma_raster::backward(&views, &frame.camera, &self.render, &rendering, &pixels);
-        let surveys = self.step < self.settings.grow_until() && self.step.is_multiple_of(self.settings.survey_every.max(1));
+        let surveys = self.step < self.settings.grow_until()
+            && self.step.is_multiple_of(self.settings.survey_every.max(1));
         let errors = surveys.then(|| {
             let pixels = densify::errors(&rendering, &target, self.settings.optimise.depth_cutoff_m);
             coma_raster::backward(&views, &frame.camera, &self.render, &rendering, &pixels)
         });
-        self.adam.step(&mut self.surfels, &gradients.submaps[0], &self.settings, self.settings.decay(self.step));
+        self.adam.step(
+            &mut self.surfels,
+            &gradients.submaps[0],
+            &self.settings,
+            self.settings.decay(self.step),
+        );
         if let Some(errors) = errors {
             let camera_from_map = self.poses[view].inverse();
             densify::note(&mut self.seen, &self.surfels, &errors.submaps[0], &camera_from_map, &frame.camera);
             self.fill_holes(view, frame, &rendering, &target.color);
         }
         self.step += 1;
-        if self.step <= self.settings.grow_until() && self.step.is_multiple_of(self.settings.grow_every.max(1)) {
+        if self.step <= self.settings.grow_until()
+            && self.step.is_multiple_of(self.settings.grow_every.max(1))
+        {
             self.grow();
         }
         Step { surfels: self.surfels.len(), ..out }
@@ -243,7 +251,11 @@ fn shuffled(count: u32, seed: u64, round: u32) -> Vec<u32> {
 fn brighten(picture: &mut Image<[f32; 3]>, rendering: &Rendering, prior: f32) {
     let sum = |image: &Image<[f32; 3]>| -> f64 {
         let pixels = image.pixels().iter().zip(rendering.opacity.pixels());
-        pixels.filter(|(_, opacity)| **opacity > 0.9).flat_map(|(pixel, _)| pixel).map(|v| f64::from(*v)).sum()
+        pixels
+            .filter(|(_, opacity)| **opacity > 0.9)
+            .flat_map(|(pixel, _)| pixel)
+            .map(|v| f64::from(*v))
+            .sum()
     };
     let (wanted, has, prior) = (sum(&rendering.color), sum(picture), f64::from(prior));
     let gain = ((wanted + prior * has) / ((1.0 + prior) * has)).clamp(0.5, 2.0);
@@ -258,7 +270,9 @@ fn psnr_db(a: &Image<[f32; 3]>, b: &Image<[f32; 3]>) -> f64 {
     // Parts are summed up in their order.
     let sums: Vec<f64> = (a.pixels().par_chunks(4096), b.pixels().par_chunks(4096))
         .into_par_iter()
-        .map(|(a, b)| a.iter().flatten().zip(b.iter().flatten()).map(|(a, b)| f64::from((a - b) * (a - b))).sum())
+        .map(|(a, b)| {
+            a.iter().flatten().zip(b.iter().flatten()).map(|(a, b)| f64::from((a - b) * (a - b))).sum()
+        })
         .collect();
     let mean = sums.iter().sum::<f64>() / (3 * a.pixels().len()).max(1) as f64;
     (-10.0 * mean.log10()).min(120.0)

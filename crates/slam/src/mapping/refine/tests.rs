@@ -16,7 +16,7 @@ fn frame(map_from_camera: &Pose) -> RgbdFrame {
     let color = Image::from_fn(48, 36, |x, y| {
         let p = at(x, y).1;
         let wave = |f: f64| ((0.5 + 0.3 * (f * p.x).sin() * (0.8 * f * p.y).cos()) * 255.0) as u8;
-        [wave(9.0), wave(17.0), wave(31.0)]
+        [wave(4.0), wave(8.0), wave(12.0)]
     });
     let depth_m = Image::from_fn(48, 36, |x, y| at(x, y).0 as f32);
     RgbdFrame::new(0, StampNs(0), camera, DepthNoise::default(), color, depth_m).unwrap()
@@ -45,7 +45,7 @@ fn coarse_map() -> SurfelCloud {
 }
 
 fn settings(steps: u32) -> RefineSettings {
-    RefineSettings { steps, grow_every: 15, poses_from_step: 10, ..RefineSettings::default() }
+    RefineSettings { steps, grow_every: 15, poses: true, poses_from_step: 10, ..RefineSettings::default() }
 }
 
 fn take(job: &mut Refiner, steps: u32) -> Vec<Step> {
@@ -117,7 +117,8 @@ fn fixed_surfels_are_rendered_and_stay_as_they_are() {
     let mut job = with();
     let steps = take(&mut job, 30);
     assert_eq!(job.fixed, fixed);
-    let mut alone = Refiner::new(settings(30), own.iter().copied().collect(), SurfelCloud::default(), poses());
+    let mut alone =
+        Refiner::new(settings(30), own.iter().copied().collect(), SurfelCloud::default(), poses());
     let without = take(&mut alone, 1);
     assert!(steps[0].psnr_db > without[0].psnr_db + 3.0, "{steps:?}\n{without:?}");
     // What the fixed ones show grows no surfels of its own.
