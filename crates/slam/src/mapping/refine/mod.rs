@@ -14,7 +14,7 @@ pub use checkpoint::CheckpointError;
 pub use settings::RefineSettings;
 
 use super::optimise::{Target, loss};
-use super::seed::seed;
+use super::seed::{SeedGrid, seed};
 use crate::tracking::TrackingSettings;
 use crate::tracking::align::Brightness;
 use crate::tracking::model::Model;
@@ -192,7 +192,7 @@ impl Refiner {
             submaps: vec![(&self.surfels, Pose::identity()), (&self.fixed, Pose::identity())],
             render: &self.render,
         };
-        let levels = self.tracking.frame_to_model.steps.len();
+        let levels = self.tracking.levels();
         let seen = TrackingView::from_frame(frame, levels);
         let found = crate::tracking::frame_to_model(
             &model,
@@ -214,7 +214,13 @@ impl Refiner {
             rendering.opacity[(x, y)] < self.settings.hole_opacity || behind
         };
         let room = self.settings.max_surfels.saturating_sub(self.surfels.len());
-        let new = seed(frame, &self.poses[view], &self.settings.seed_holes, wanted, |x, y| color[(x, y)]);
+        let grid = SeedGrid::of(&frame.camera, &self.settings.seed_holes);
+        let wanted = Image::from_fn(grid.camera.width as usize, grid.camera.height as usize, |i, j| {
+            let (x, y) = grid.pixel(i, j);
+            wanted(x, y)
+        });
+        let settings = &self.settings.seed_holes;
+        let new = seed(frame, &self.poses[view], settings, &grid, &wanted, |x, y| color[(x, y)]);
         for surfel in new.into_iter().take(room) {
             self.surfels.push(surfel);
         }

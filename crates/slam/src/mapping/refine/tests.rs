@@ -1,5 +1,5 @@
 use super::*;
-use crate::mapping::seed::SeedSettings;
+use crate::mapping::seed::{SeedGrid, SeedSettings};
 use coma_frame::DepthNoise;
 use coma_geometry::{Intrinsics, StampNs, se3};
 use nalgebra::Vector3;
@@ -37,8 +37,10 @@ fn coarse_map() -> SurfelCloud {
     let mut out = SurfelCloud::default();
     let first = frame(&poses()[2]);
     let color = first.color.to_unit();
-    let wanted = |_, _| true;
-    for surfel in seed(&first, &poses()[2], &settings, wanted, |x, y| color[(x, y)].map(|v| 0.9 * v)) {
+    let grid = SeedGrid::of(&first.camera, &settings);
+    let all = Image::filled(grid.camera.width as usize, grid.camera.height as usize, true);
+    let faded = |x, y| color[(x, y)].map(|v: f32| 0.9 * v);
+    for surfel in seed(&first, &poses()[2], &settings, &grid, &all, faded) {
         out.push(surfel);
     }
     out
