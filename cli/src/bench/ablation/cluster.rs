@@ -75,7 +75,7 @@ mod tests {
             depth_pixels: 10,
         };
         let report = Report {
-            pictures: Pictures { held_out: None, training: Some(scores) },
+            pictures: Pictures { training: Some(scores), ..Pictures::default() },
             map: Some(MapSize { submaps: 3, surfels: 77, bytes: 1 }),
             ..Default::default()
         };
