@@ -111,11 +111,13 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     succeeds(&["run", &left, &right, "--hold-out", "4", "--out", &run]);
     let base = std::fs::read(folder.path().join("run/map.ply")).unwrap();
     let steps = ["--steps", "60", "--checkpoint-every", "5", "--poses"];
-    let refine = |more: &[&str]| [&["refine", &run][..], &steps[..], more].concat();
+    fn words<'a>(run: &'a str, steps: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
+        [&["refine", run][..], steps, more].concat()
+    }
     let refined = |name: &str| folder.path().join("run/refined").join(name);
 
     // Killed once a checkpoint is there.
-    let arguments = refine(&[]);
+    let arguments = words(&run, &steps, &[]);
     let mut child = Command::new(env!("CARGO_BIN_EXE_coma")).args(&arguments).spawn().expect("it starts");
     while !refined("map.checkpoint").exists() {
         assert!(child.try_wait().unwrap().is_none(), "it ended without a checkpoint");
@@ -148,7 +150,7 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     // One agent's share: nothing of the other's sequence is read, it need not even be there.
     std::fs::remove_dir_all(folder.path().join("run/refined")).unwrap();
     std::fs::rename(path("left"), path("away")).unwrap();
-    succeeds(&refine(&["--agent", "right"]));
+    succeeds(&words(&run, &steps, &["--agent", "right"]));
     std::fs::rename(path("away"), path("left")).unwrap();
     let share = json(&refined("share-right.json"));
     let agents: Vec<&str> =
@@ -157,7 +159,7 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     succeeds(&["eval", &run]);
     let report = json(&folder.path().join("run/report.json"));
     assert!(report["pictures"]["refined_training"]["psnr_db"].as_f64().is_some(), "{}", report["pictures"]);
-    let unknown = fails(&refine(&["--agent", "middle"]));
+    let unknown = fails(&words(&run, &steps, &["--agent", "middle"]));
     assert!(unknown.contains("middle") && unknown.contains("left, right"), "{unknown}");
 }
 
