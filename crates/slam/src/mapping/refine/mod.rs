@@ -14,7 +14,7 @@ pub use checkpoint::CheckpointError;
 pub use settings::RefineSettings;
 
 use super::optimise::{Target, loss};
-use super::seed::seed;
+use super::seed::{SeedGrid, seed};
 use crate::tracking::TrackingSettings;
 use crate::tracking::align::Brightness;
 use crate::tracking::model::Model;
@@ -192,7 +192,7 @@ impl Refiner {
             submaps: vec![(&self.surfels, Pose::identity()), (&self.fixed, Pose::identity())],
             render: &self.render,
         };
-        let levels = self.tracking.frame_to_model.steps.len();
+        let levels = self.tracking.levels();
         let seen = TrackingView::from_frame(frame, levels);
         let found = crate::tracking::frame_to_model(
             &model,
@@ -209,12 +209,16 @@ impl Refiner {
     /// Surfels for pixels with depth that the map does not cover.
     fn fill_holes(&mut self, view: usize, frame: &RgbdFrame, rendering: &Rendering, color: &Image<[f32; 3]>) {
         let cutoff_m = self.settings.optimise.depth_cutoff_m;
-        let wanted = |x: usize, y: usize| {
-            let behind = rendering.depth_m[(x, y)] - frame.depth_m[(x, y)] > cutoff_m;
-            rendering.opacity[(x, y)] < self.settings.hole_opacity || behind
-        };
+        let settings = &self.settings.seed_holes;
+        let grid = SeedGrid::of(&frame.camera, settings);
+        let (width, height) = (grid.camera.width as usize, grid.camera.height as usize);
+        let wanted = Image::from_fn(width, height, |i, j| {
+            let at = grid.pixel(i, j);
+            let behind = rendering.depth_m[at] - frame.depth_m[at] > cutoff_m;
+            rendering.opacity[at] < self.settings.hole_opacity || behind
+        });
         let room = self.settings.max_surfels.saturating_sub(self.surfels.len());
-        let new = seed(frame, &self.poses[view], &self.settings.seed_holes, wanted, |x, y| color[(x, y)]);
+        let new = seed(frame, &self.poses[view], settings, &grid, &wanted, |x, y| color[(x, y)]);
         for surfel in new.into_iter().take(room) {
             self.surfels.push(surfel);
         }
