@@ -111,14 +111,11 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     succeeds(&["run", &left, &right, "--hold-out", "4", "--out", &run]);
     let base = std::fs::read(folder.path().join("run/map.ply")).unwrap();
     let steps = ["--steps", "60", "--checkpoint-every", "5", "--poses"];
-    fn words<'a>(run: &'a str, steps: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
-        [&["refine", run][..], steps, more].concat()
-    }
+    let (refine, of_right) = ([&["refine", &run][..], &steps[..]].concat(), ["--agent", "right"]);
     let refined = |name: &str| folder.path().join("run/refined").join(name);
 
     // Killed once a checkpoint is there.
-    let arguments = words(&run, &steps, &[]);
-    let mut child = Command::new(env!("CARGO_BIN_EXE_coma")).args(&arguments).spawn().expect("it starts");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_coma")).args(&refine).spawn().expect("it starts");
     while !refined("map.checkpoint").exists() {
         assert!(child.try_wait().unwrap().is_none(), "it ended without a checkpoint");
         std::thread::yield_now();
@@ -127,16 +124,16 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     child.wait().unwrap();
     let whole = std::fs::read(refined("map.checkpoint")).unwrap();
     std::fs::write(refined("map.checkpoint"), &whole[..whole.len() - 7]).unwrap();
-    let torn = fails(&arguments);
+    let torn = fails(&refine);
     assert!(torn.contains("map.checkpoint") && torn.contains("torn"), "{torn}");
     std::fs::write(refined("map.checkpoint"), &whole).unwrap();
-    assert!(succeeds(&arguments).contains("goes on after step"));
+    assert!(succeeds(&refine).contains("goes on after step"));
     let cut_off = std::fs::read(refined("map.ply")).unwrap();
     assert!(!refined("map.checkpoint").exists());
-    let again = fails(&arguments);
+    let again = fails(&refine);
     assert!(again.contains("map.json"), "a refined map is not overwritten: {again}");
     std::fs::remove_dir_all(folder.path().join("run/refined")).unwrap();
-    succeeds(&arguments);
+    succeeds(&refine);
     assert!(std::fs::read(refined("map.ply")).unwrap() == cut_off, "the same bits");
     assert!(std::fs::read(folder.path().join("run/map.ply")).unwrap() == base, "the run's own map stays");
 
@@ -150,7 +147,7 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     // One agent's share: nothing of the other's sequence is read, it need not even be there.
     std::fs::remove_dir_all(folder.path().join("run/refined")).unwrap();
     std::fs::rename(path("left"), path("away")).unwrap();
-    succeeds(&words(&run, &steps, &["--agent", "right"]));
+    succeeds(&[&refine[..], &of_right[..]].concat());
     std::fs::rename(path("away"), path("left")).unwrap();
     let share = json(&refined("share-right.json"));
     let agents: Vec<&str> =
@@ -159,7 +156,7 @@ fn a_finished_map_is_refined_even_if_cut_off_and_each_agent_refines_its_share() 
     succeeds(&["eval", &run]);
     let report = json(&folder.path().join("run/report.json"));
     assert!(report["pictures"]["refined_training"]["psnr_db"].as_f64().is_some(), "{}", report["pictures"]);
-    let unknown = fails(&words(&run, &steps, &["--agent", "middle"]));
+    let unknown = fails(&[&refine[..], &["--agent", "middle"]].concat());
     assert!(unknown.contains("middle") && unknown.contains("left, right"), "{unknown}");
 }
 

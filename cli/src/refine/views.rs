@@ -10,7 +10,7 @@ use coma_dataset::Sequence;
 use coma_frame::RgbdFrame;
 use coma_geometry::Pose;
 use std::path::Path;
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 
 /// One of them.
@@ -22,11 +22,17 @@ pub struct View {
     map_from_camera: Pose,
 }
 
+/// Agents' names and what they saw.
+type Sequences = Vec<(String, Box<dyn Sequence>)>;
+
+/// Frames that are asked for and not yet taken: the one that is needed and the one after.
+const AHEAD: usize = 2;
+
 /// All of them, agent by agent.
 pub struct Views {
     /// In the order of the job's views.
     pub of: Vec<View>,
-    sequences: Arc<Mutex<Vec<(String, Box<dyn Sequence>)>>>,
+    sequences: Arc<Mutex<Sequences>>,
     names: Vec<String>,
 }
 
@@ -69,8 +75,8 @@ impl Views {
 
     /// Begins to read `first`.
     pub fn reader(&self, first: Option<usize>) -> anyhow::Result<Reader> {
-        let (ask, asked) = channel::<(usize, usize)>();
-        let (give, given) = channel();
+        let (ask, asked) = sync_channel::<(usize, usize)>(AHEAD);
+        let (give, given) = sync_channel(AHEAD);
         let sequences = self.sequences.clone();
         std::thread::Builder::new().name("frames".into()).spawn(move || {
             let Ok(sequences) = sequences.lock() else { return };
@@ -92,7 +98,7 @@ impl Views {
 
 /// Reads one frame ahead.
 pub struct Reader {
-    ask: Sender<(usize, usize)>,
+    ask: SyncSender<(usize, usize)>,
     given: Receiver<anyhow::Result<RgbdFrame>>,
     at: Vec<(usize, usize)>,
 }

@@ -209,17 +209,15 @@ impl Refiner {
     /// Surfels for pixels with depth that the map does not cover.
     fn fill_holes(&mut self, view: usize, frame: &RgbdFrame, rendering: &Rendering, color: &Image<[f32; 3]>) {
         let cutoff_m = self.settings.optimise.depth_cutoff_m;
-        let wanted = |x: usize, y: usize| {
-            let behind = rendering.depth_m[(x, y)] - frame.depth_m[(x, y)] > cutoff_m;
-            rendering.opacity[(x, y)] < self.settings.hole_opacity || behind
-        };
-        let room = self.settings.max_surfels.saturating_sub(self.surfels.len());
-        let grid = SeedGrid::of(&frame.camera, &self.settings.seed_holes);
-        let wanted = Image::from_fn(grid.camera.width as usize, grid.camera.height as usize, |i, j| {
-            let (x, y) = grid.pixel(i, j);
-            wanted(x, y)
-        });
         let settings = &self.settings.seed_holes;
+        let grid = SeedGrid::of(&frame.camera, settings);
+        let (width, height) = (grid.camera.width as usize, grid.camera.height as usize);
+        let wanted = Image::from_fn(width, height, |i, j| {
+            let at = grid.pixel(i, j);
+            let behind = rendering.depth_m[at] - frame.depth_m[at] > cutoff_m;
+            rendering.opacity[at] < self.settings.hole_opacity || behind
+        });
+        let room = self.settings.max_surfels.saturating_sub(self.surfels.len());
         let new = seed(frame, &self.poses[view], settings, &grid, &wanted, |x, y| color[(x, y)]);
         for surfel in new.into_iter().take(room) {
             self.surfels.push(surfel);

