@@ -27,6 +27,7 @@ pub use geometry::finite;
 pub use limited::Limited;
 pub use log::{entry_from_bytes, entry_to_bytes, hash, version_vector};
 pub use payload::{decode_payload, encode_payload};
+pub use prost::Message;
 
 /// The words of the log that conversions give, for services that know agents by their messages alone.
 pub mod entries {

@@ -7,7 +7,7 @@ use coma_wire::v1::peer_server::Peer;
 use coma_wire::{At, PROTOCOL_MAJOR, PROTOCOL_MINOR, Wire, invalid, v1};
 use futures::Stream;
 use futures::stream;
-use prost::Message;
+use coma_wire::Message;
 use std::pin::Pin;
 use std::sync::Arc;
 use tonic::{Request, Response, Status};

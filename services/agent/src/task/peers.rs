@@ -7,7 +7,7 @@ use coma_runtime::{Class, channel};
 use coma_slam::log::{Entry, Evidence};
 use coma_wire::v1::peer_client::PeerClient;
 use coma_wire::{At, FieldError, Limited, PROTOCOL_MAJOR, PROTOCOL_MINOR, Wire, v1};
-use prost::Message;
+use coma_wire::Message;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
