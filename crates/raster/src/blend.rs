@@ -159,12 +159,10 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
                         let alpha = live.select(hit.alpha, zero);
                         let gap = hit.depth.mul_add(surface, zero - surface_depth).abs();
                         let joins = gap.at_most(constants.surface_relative * hit.depth * surface);
-                        let replaces = surface.less(alpha);
-                        let kept = replaces.select(zero, surface);
-                        let added = joins.or(replaces).select(alpha, zero);
-                        surface = joins.select(surface, kept) + added;
-                        let kept = replaces.select(zero, surface_depth);
-                        surface_depth = added.mul_add(hit.depth, joins.select(surface_depth, kept));
+                        let outweighs = surface.less(alpha);
+                        let (joined, own) = (alpha.mul_add(hit.depth, surface_depth), alpha * hit.depth);
+                        surface_depth = joins.select(joined, outweighs.select(own, surface_depth));
+                        surface = joins.select(surface + alpha, outweighs.select(alpha, surface));
                     }
                     if NORMAL {
                         // The normal that faces the camera: its plane's offset is negative.

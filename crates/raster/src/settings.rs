@@ -33,6 +33,13 @@ impl Default for RenderSettings {
     }
 }
 
+impl RenderSettings {
+    /// The same for a picture of `factor` times the resolution: the low-pass keeps its size in the scene.
+    pub fn resized(&self, factor: f64) -> RenderSettings {
+        RenderSettings { low_pass_px: self.low_pass_px * factor as f32, ..*self }
+    }
+}
+
 /// Eq. 5 in the blending pass: is there a surfel near the observed depth? One that is hidden counts too: what
 /// is known need not grow again.
 #[derive(Clone, Copy, Debug)]

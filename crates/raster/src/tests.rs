@@ -83,6 +83,13 @@ fn the_oracle_agrees_everywhere() {
             let found = rendering.depth_m.pixels()[i] as f64;
             assert!((found - o.depth).abs() < 0.02, "depth {found} {}", o.depth);
         }
+        let other = |(i, o): &(usize, &OraclePixel)| {
+            let found = rendering.surface_depth_m.pixels()[*i] as f64;
+            (found - o.surface).abs() > 1e-3
+        };
+        // A hit may fall to either of two surfaces.
+        let others = oracle.iter().enumerate().filter(other).count();
+        assert!(others <= 8, "another surface at {others} pixels");
     }
 }
 

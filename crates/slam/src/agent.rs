@@ -298,16 +298,15 @@ impl Agent {
         self.guesses = 0;
         self.brightness = tracked.brightness;
         let mut events = Vec::new();
-        let mut inherited = None;
-        if options.map && self.active.as_ref().is_some_and(|a| a.is_full(&self.settings.mapping)) {
-            inherited = self.active.as_ref().map(|active| {
-                let submap_from_anchor = active.agent_from_submap.inv_mul(&tracked.agent_from_camera);
-                active.bequeath(&submap_from_anchor, &view, &self.settings.mapping)
-            });
+        let mut inherited = Inheritance::default();
+        let full = self.active.as_ref().filter(|a| options.map && a.is_full(&self.settings.mapping));
+        if let Some(full) = full {
+            let submap_from_anchor = full.agent_from_submap.inv_mul(&tracked.agent_from_camera);
+            inherited = full.bequeath(&submap_from_anchor, &view, &self.settings.mapping);
             events.extend(self.close_active());
         }
         if self.active.is_none() {
-            events.extend(self.follow_recent(&frame, &tracked, inherited.unwrap_or_default()));
+            events.extend(self.follow_recent(&frame, &tracked, inherited));
         }
         let mut mapped = MappedFrame::default();
         let pose = self.active.as_mut().map(|active| {

@@ -50,17 +50,9 @@ pub fn fuse(
     let level = &view.levels[0];
     let camera = &level.camera;
     let (fx, fy, cx, cy) = (camera.fx as f32, camera.fy as f32, camera.cx as f32, camera.cy as f32);
-    let (width, height) = (level.depth_m.width() as f32, level.depth_m.height() as f32);
     let one = |center: &mut [f32; 3], turn: &mut [f32; 4], variance: &mut f32| {
         let p = rotation * Vector3::from(*center) + translation;
-        if !(p.z > 0.05) {
-            return;
-        }
-        let (u, v) = (fx * p.x / p.z + cx + 0.5, fy * p.y / p.z + cy + 0.5);
-        if !(u >= 0.0 && v >= 0.0 && u < width && v < height) {
-            return;
-        }
-        let pixel = (u as usize, v as usize);
+        let Some(pixel) = level.place(&p).and_then(|place| level.pixel(place)) else { return };
         let (z, seen) = (level.depth_m[pixel], Vector3::from(level.normal[pixel]));
         if !(z > 0.0) || seen == Vector3::zeros() {
             return;
@@ -108,4 +100,54 @@ pub fn fuse(
                 one(center, turn, variance);
             }
         });
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use coma_frame::{DepthNoise, Image};
+    use coma_geometry::Intrinsics;
+    use coma_surfel::Surfel;
+
+    const CAMERA: Intrinsics = Intrinsics { width: 32, height: 24, fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5 };
+    const NOISE: DepthNoise = DepthNoise { base_m: 0.01, quadratic_per_m: 0.0 };
+
+    /// A wall as the sensor sees it.
+    fn wall(depth_m: f32) -> TrackingView {
+        TrackingView::build(CAMERA, Image::filled(32, 24, depth_m), Image::filled(32, 24, 0.5), NOISE, 1)
+    }
+
+    /// One surfel that faces the camera, in the middle of the picture.
+    fn surfel(depth_m: f32) -> SurfelCloud {
+        let surfel = Surfel {
+            center_m: [0.0, 0.0, depth_m],
+            rotation_wxyz: [0.0, 1.0, 0.0, 0.0],
+            scale_m: [0.05; 2],
+            opacity: 0.9,
+            color: [0.5; 3],
+        };
+        [surfel].into_iter().collect()
+    }
+
+    #[test]
+    fn a_surfel_ends_at_the_mean_of_what_was_measured() {
+        let (mut cloud, mut variance) = (surfel(2.0), [1e-4]);
+        let measured = [2.01, 1.99, 2.02, 2.01, 2.00, 1.98];
+        for depth_m in measured {
+            fuse(&mut cloud, &mut variance, &wall(depth_m), &Pose::identity(), &FuseSettings::default());
+        }
+        // The birth counts as one measurement of the same noise.
+        let mean = (2.0 + measured.iter().sum::<f32>()) / 7.0;
+        assert!((cloud.center_m[0][2] - mean).abs() < 1e-5, "{:?}", cloud.center_m);
+        assert!((variance[0] - 1e-4 / 7.0).abs() < 1e-8, "{variance:?}");
+    }
+
+    #[test]
+    fn another_surface_moves_nothing() {
+        for depth_m in [1.9, 2.1, 0.0] {
+            let (mut cloud, mut variance) = (surfel(2.0), [1e-4]);
+            fuse(&mut cloud, &mut variance, &wall(depth_m), &Pose::identity(), &FuseSettings::default());
+            assert_eq!((cloud, variance), (surfel(2.0), [1e-4]), "a wall at {depth_m} m");
+        }
+    }
 }

@@ -4,7 +4,7 @@
 use crate::tracking::view::TrackingView;
 use coma_geometry::Pose;
 use coma_surfel::SurfelCloud;
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use serde::{Deserialize, Serialize};
 
 /// What a new submap takes over.
@@ -51,43 +51,69 @@ pub fn inherit(
     if !settings.enabled {
         return out;
     }
-    let turn: UnitQuaternion<f32> = anchor_from_submap.rotation.cast();
-    let translation: Vector3<f32> = anchor_from_submap.translation.vector.cast();
     let level = &view.levels[0];
     let (width, height) = (level.depth_m.width() as f32, level.depth_m.height() as f32);
-    let (fx, fy) = (level.camera.fx as f32, level.camera.fy as f32);
-    let (cx, cy) = (level.camera.cx as f32, level.camera.cy as f32);
     let (beyond_x, beyond_y) = (settings.margin * width, settings.margin * height);
-    for (mut surfel, variance) in surfels.iter().zip(variance_m2) {
-        let p = turn * Vector3::from(surfel.center_m) + translation;
-        if !(p.z > 0.05) {
-            continue;
-        }
-        let (u, v) = (fx * p.x / p.z + cx + 0.5, fy * p.y / p.z + cy + 0.5);
+    for (surfel, variance) in surfels.iter().zip(variance_m2) {
+        let surfel = surfel.moved(anchor_from_submap);
+        let center = Vector3::from(surfel.center_m);
+        let Some((u, v)) = level.place(&center) else { continue };
         if !(u >= -beyond_x && v >= -beyond_y && u < width + beyond_x && v < height + beyond_y) {
             continue;
         }
-        let inside = u >= 0.0 && v >= 0.0;
-        let measured = level.depth_m.get(u as usize, v as usize).copied().filter(|z| inside && *z > 0.0);
-        if measured.is_some_and(|z| (z - p.z).abs() > settings.relative * z) {
+        let measured = level.pixel((u, v)).map(|pixel| level.depth_m[pixel]).filter(|z| *z > 0.0);
+        if measured.is_some_and(|z| (z - center.z).abs() > settings.relative * z) {
             continue;
         }
         // The smaller scale isn't stretched along an incline.
-        let size = surfel.scale_m[0].min(surfel.scale_m[1]) * fx / p.z / seed_px;
-        if !(size >= settings.min_size && size <= settings.max_size) {
-            continue;
+        let size = surfel.scale_m[0].min(surfel.scale_m[1]) * level.camera.fx as f32 / center.z / seed_px;
+        if size >= settings.min_size && size <= settings.max_size {
+            out.surfels.push(surfel);
+            out.variance_m2.push(*variance);
         }
-        let own = UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(
-            surfel.rotation_wxyz[0],
-            surfel.rotation_wxyz[1],
-            surfel.rotation_wxyz[2],
-            surfel.rotation_wxyz[3],
-        ));
-        let q = turn * own;
-        surfel.center_m = p.into();
-        surfel.rotation_wxyz = [q.w, q.i, q.j, q.k];
-        out.surfels.push(surfel);
-        out.variance_m2.push(*variance);
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use coma_frame::{DepthNoise, Image};
+    use coma_geometry::Intrinsics;
+    use coma_surfel::Surfel;
+
+    #[test]
+    fn what_the_anchor_sees_at_its_own_size_comes_along() {
+        let camera = Intrinsics { width: 32, height: 24, fx: 30.0, fy: 30.0, cx: 15.5, cy: 11.5 };
+        let gray = Image::filled(32, 24, 0.5);
+        let view = TrackingView::build(camera, Image::filled(32, 24, 2.0), gray, DepthNoise::default(), 1);
+        // Where in the anchor's camera, how large in pixels, and whether it comes along.
+        let cases = [
+            ([0.0, 0.0, 2.0], 1.6, true),
+            ([0.0, 0.0, 3.0], 1.6, false),  // behind the wall
+            ([0.0, 0.0, -2.0], 1.6, false), // behind the camera
+            ([1.1, 0.0, 2.0], 1.6, true),   // half a pixel beside the picture
+            ([2.0, 0.0, 2.0], 1.6, false),  // far beside it
+            ([0.0, 0.0, 2.0], 0.5, false),  // too fine
+            ([0.0, 0.0, 2.0], 4.0, false),  // too coarse
+        ];
+        let anchor_from_submap = Pose::translation(0.5, 0.0, 0.0);
+        for (center_m, size_px, comes) in cases {
+            let seen = Surfel {
+                center_m,
+                rotation_wxyz: [0.0, 1.0, 0.0, 0.0],
+                scale_m: [size_px * 2.0 / 30.0; 2],
+                opacity: 0.9,
+                color: [0.5; 3],
+            };
+            let cloud = [seen.moved(&anchor_from_submap.inverse())].into_iter().collect();
+            let settings = InheritSettings::default();
+            let found = inherit(&cloud, &[1e-4], &anchor_from_submap, &view, 1.6, &settings);
+            assert_eq!(found.variance_m2.len(), comes as usize, "{center_m:?}, {size_px} px");
+            if comes {
+                let off = Vector3::from(found.surfels.center_m[0]) - Vector3::from(center_m);
+                assert!(off.norm() < 1e-6, "{off:?}");
+            }
+        }
+    }
 }

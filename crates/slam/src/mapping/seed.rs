@@ -100,7 +100,6 @@ pub fn seed(
     wanted: &Image<bool>,
     color_at: impl Fn(usize, usize) -> [f32; 3],
 ) -> Vec<Surfel> {
-    let normal = normals::normals_from_depth(&frame.depth_m, &frame.camera, 0.05, 2);
     let rotation = submap_from_camera.rotation.to_rotation_matrix().matrix().cast::<f32>();
     let translation: Vector3<f32> = submap_from_camera.translation.vector.cast();
     let mut out = Vec::new();
@@ -110,7 +109,7 @@ pub fn seed(
                 continue;
             }
             let (x, y) = grid.pixel(i, j);
-            let Some((center, axes, fitted)) = disc(frame, &normal, x, y, settings) else { continue };
+            let Some((center, axes, fitted)) = disc(frame, x, y, settings) else { continue };
             let submap_axes = Rotation3::from_matrix_unchecked(rotation * axes);
             let (q, scale) = match settings.fit {
                 Fit::Surface => (UnitQuaternion::from_rotation_matrix(&submap_axes), fitted),
@@ -134,16 +133,12 @@ pub fn seed(
 /// Centre, axes `(e1, e2, n)` and scales of a pixel's disc, in the camera.
 fn disc(
     frame: &RgbdFrame,
-    normal: &Image<[f32; 3]>,
     x: usize,
     y: usize,
     settings: &SeedSettings,
 ) -> Option<(Vector3<f32>, Matrix3<f32>, [f32; 2])> {
     let z = frame.depth_m[(x, y)];
-    let n = Vector3::from(normal[(x, y)]);
-    if !(z > 0.0) || n == Vector3::zeros() {
-        return None;
-    }
+    let n = Vector3::from(normals::normal_at(&frame.depth_m, &frame.camera, 0.05, 2, x, y)?);
     let ray: Vector3<f32> = frame.camera.ray(x as f64, y as f64).cast();
     let view = ray.normalize();
     // eq. (8): R = (e1, e2, n); e1 lies along the incline, so that only it needs stretching.

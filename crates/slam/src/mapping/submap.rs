@@ -91,8 +91,7 @@ pub struct ActiveSubmap {
     mapped_frames: u32,
     moving_frames: u32,
     last_counted: Pose,
-    next_keyframe: usize,
-    steps_taken: u32,
+    steps_taken: usize,
     /// Optimiser steps that are due until the next keyframe.
     owed_steps: u32,
 }
@@ -128,7 +127,6 @@ impl ActiveSubmap {
             mapped_frames: 0,
             moving_frames: 0,
             last_counted: Pose::identity(),
-            next_keyframe: 0,
             steps_taken: 0,
             owed_steps: 0,
         }
@@ -168,8 +166,7 @@ impl ActiveSubmap {
             sigma_factor: settings.growth_sigma,
             relative: settings.growth_relative,
         };
-        let shrunk = (grid.camera.fx / frame.camera.fx) as f32;
-        let coarse = RenderSettings { low_pass_px: render_settings.low_pass_px * shrunk, ..*render_settings };
+        let coarse = render_settings.resized(grid.camera.fx / frame.camera.fx);
         let rendering =
             coma_raster::render_only(&views, &grid.camera, &coarse, Some(&test), Outputs::OPTIMISING);
         out.hits += rendering.hits;
@@ -242,9 +239,8 @@ impl ActiveSubmap {
         for _ in 0..steps {
             // Every other step on the newest keyframe, the rest in turn.
             let newest = self.steps_taken.is_multiple_of(2);
-            self.steps_taken = self.steps_taken.wrapping_add(1);
-            let pick = if newest { count - 1 } else { self.next_keyframe % count };
-            self.next_keyframe += !newest as usize;
+            let pick = if newest { count - 1 } else { self.steps_taken / 2 % count };
+            self.steps_taken += 1;
             let target = &self.keyframes[pick];
             let (loss, hits) =
                 optimise_once(&mut self.surfels, &mut self.adam, target, render_settings, &settings.optimise);

@@ -214,7 +214,7 @@ pub fn frame_to_model(
     let mut hits = 0;
     let mut last = None;
     for _ in 0..settings.model_rounds.max(1) {
-        let picture = model.picture(&pose, &view.levels[0].camera, &full, view, settings);
+        let picture = model.picture(&pose, &full, view, settings);
         hits += picture.hits;
         let Some(found) = align(&picture.view, view, &Pose::identity(), brightness, &settings.frame_to_model)
         else {

@@ -24,11 +24,11 @@ pub struct ModelPicture {
 }
 
 impl Model<'_> {
-    /// Renders the model for a camera at `agent_from_camera`; `full` is the same at the sensor's own resolution.
+    /// Renders the model at the resolution of `like` for a camera at `agent_from_camera`; `full` is the camera at the
+    /// sensor's own resolution.
     pub fn picture(
         &self,
         agent_from_camera: &Pose,
-        camera: &Intrinsics,
         full: &Intrinsics,
         like: &TrackingView,
         settings: &TrackingSettings,
@@ -42,9 +42,8 @@ impl Model<'_> {
                 camera_from_submap: camera_from_agent * agent_from_submap,
             })
             .collect();
-        // The same low-pass in the frame's pixels, at whatever resolution.
-        let shrunk = camera.fx / full.fx;
-        let render = RenderSettings { low_pass_px: self.render.low_pass_px * shrunk as f32, ..*self.render };
+        let camera = &like.levels[0].camera;
+        let render = self.render.resized(camera.fx / full.fx);
         let rendering = coma_raster::render_only(&views, camera, &render, None, Outputs::TRACKING);
         let depth_m = trusted_depth(&rendering, settings);
         let intensity = rendering.color.map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]);

@@ -2,6 +2,7 @@
 
 use coma_frame::{DepthNoise, Image, RgbdFrame, normals, pyramid};
 use coma_geometry::Intrinsics;
+use nalgebra::Vector3;
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -9,6 +10,8 @@ use std::sync::Arc;
 pub const DEPTH_JUMP: f32 = 0.05;
 /// Pixels next to a depth jump that are not trusted.
 const JUMP_MARGIN_PX: usize = 2;
+/// Nearer points are not looked at, metres.
+const NEAR_M: f32 = 0.05;
 /// Surfaces seen under more than 75 degrees from their normal are not trusted.
 const GRAZING_COS: f32 = 0.2588;
 
@@ -25,6 +28,23 @@ pub struct Level {
     pub intensity: Image<f32>,
     /// Central differences of intensity per pixel. `[height, width]`
     pub gradient: Image<[f32; 2]>,
+}
+
+impl Level {
+    /// Where a point of the camera's frame is seen, counted from the picture's corner: `(0.7, 3.2)` lies in pixel
+    /// (0, 3). May lie outside; `None` behind the camera.
+    pub fn place(&self, point: &Vector3<f32>) -> Option<(f32, f32)> {
+        let c = &self.camera;
+        let u = c.fx as f32 * point.x / point.z + c.cx as f32 + 0.5;
+        let v = c.fy as f32 * point.y / point.z + c.cy as f32 + 0.5;
+        (point.z > NEAR_M).then_some((u, v))
+    }
+
+    /// The pixel at such a place, if it lies inside.
+    pub fn pixel(&self, (u, v): (f32, f32)) -> Option<(usize, usize)> {
+        let (width, height) = (self.depth_m.width() as f32, self.depth_m.height() as f32);
+        (u >= 0.0 && v >= 0.0 && u < width && v < height).then_some((u as usize, v as usize))
+    }
 }
 
 /// A picture to align or to align to; level 0 is the finest.
