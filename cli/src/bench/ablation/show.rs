@@ -71,10 +71,14 @@ pub fn page(ablation: &Ablation) -> String {
          ATE is the mean over the agents of each one's RMSE after a rigid alignment without scale. Pictures: {} views of \
          each agent, evenly spread, rendered from the merged map of its own submaps at its own poses, without \
          refinement; these frames were mapped. Surfels are those of all closed submaps; merged is what is left when \
-         what two submaps show is kept once. Times are processor time of all threads per frame. In the second table \
-         all agents run as `coma run` runs them, and views are its training views.\n\n",
+         what two submaps show is kept once. Times are processor time of all threads per frame.\n\n",
         ablation.views
     );
+    if !ablation.cluster.is_empty() {
+        out.push_str(
+            "In the second table all agents run as `coma run` runs them, and views are its training views.\n\n",
+        );
+    }
     let _ = writeln!(out, "{}\n", settings(&ablation.settings));
     for row in &ablation.alone {
         let _ = writeln!(out, "- **{}**: {}.", row.variant.name(), row.variant.change());
