@@ -46,7 +46,7 @@ impl Default for AlignSettings {
             finest_stride: 1,
             max_distance_sigma: 8.0,
             max_distance_m: 0.06,
-            photometric_weight: 0.5,
+            photometric_weight: 0.8,
             min_photometric_scale: 0.008,
             min_geometric_scale: 0.1,
             huber: 1.345,
@@ -83,7 +83,7 @@ pub struct Alignment {
     pub pixels: usize,
     /// Those that found a partner.
     pub matched: usize,
-    /// Those whose point-to-plane residual is within 3 scales.
+    /// Those whose point-to-plane residual is within 3 scales or 1 % of the depth.
     pub inliers: usize,
     /// Robust scale of the geometric residuals, in units of sigma(z).
     pub geometric_scale: f64,
@@ -243,6 +243,9 @@ struct System {
 /// Pixels that err together: residuals of one 16x16 block are about one effective sample; a stride thins it.
 pub const CORRELATED_PIXELS: f64 = 64.0;
 
+/// A point within this share of its depth fits, however sure the sensor is of it.
+const FITS_RELATIVE: f32 = 0.01;
+
 /// Rows that one task sums up: fixed, so that sums do not depend on the number of threads.
 const ROWS_PER_TASK: usize = 16;
 
@@ -373,7 +376,8 @@ impl System {
             self.geometric.add(distance);
             self.distance.add(distance / matches.inv_sigma[i]);
             self.photometric.add(matches.difference[i].abs());
-            self.inliers += (distance * weights.inv_geometric < 3.0) as usize;
+            let close = distance < FITS_RELATIVE * matches.point[2][i].abs() * matches.inv_sigma[i];
+            self.inliers += (close || distance * weights.inv_geometric < 3.0) as usize;
         }
         let sums = rows::sum(matches, &weights);
         let mut k = 0;

@@ -1,0 +1,154 @@
+//! One agent alone, without a network: it keeps still, is lost and found again, and gives the same bits.
+
+use coma_dataset::sequence::rgbd_frame;
+use coma_dataset::world::{SensorNoise, World, WorldSettings};
+use coma_frame::{DepthNoise, Image, RgbdFrame};
+use coma_geometry::{AgentId, Epoch, se3};
+use coma_slam::agent::{Agent, Event, FrameOptions, FrameOutcome, SlamSettings};
+use coma_slam::tracking::State;
+use std::sync::Arc;
+
+/// The first frames of the built-in world's first walk.
+fn frames(count: usize, width: u32, noise: Option<SensorNoise>) -> Vec<Arc<RgbdFrame>> {
+    let height = width * 3 / 4;
+    let settings =
+        WorldSettings { agents: 1, frames: count, width, height, noise, ..WorldSettings::default() };
+    let sequence = World::new(settings).unwrap().sequence(0).unwrap();
+    (0..count).map(|index| Arc::new(rgbd_frame(&sequence, index).unwrap())).collect()
+}
+
+fn agent() -> Agent {
+    Agent::new(AgentId::new("a").unwrap(), Epoch(1), None, SlamSettings::default())
+}
+
+fn take(agent: &mut Agent, frame: &Arc<RgbdFrame>) -> FrameOutcome {
+    agent.on_frame(frame.clone(), FrameOptions::default())
+}
+
+/// A covered lens.
+fn black(frame: &RgbdFrame) -> Arc<RgbdFrame> {
+    let (width, height) = (frame.depth_m.width(), frame.depth_m.height());
+    let (color, depth) = (Image::filled(width, height, [0u8; 3]), Image::filled(width, height, 0.0f32));
+    Arc::new(RgbdFrame::new(frame.sequence, frame.stamp, frame.camera, frame.noise, color, depth).unwrap())
+}
+
+#[test]
+fn a_camera_that_stands_still_for_10_000_frames_makes_no_new_submap() {
+    let size = 160;
+    let settings = WorldSettings {
+        agents: 1,
+        frames: 1,
+        width: size,
+        height: size * 3 / 4,
+        noise: None,
+        ..WorldSettings::default()
+    };
+    let frame = rgbd_frame(&World::new(settings).unwrap().sequence(0).unwrap(), 0).unwrap();
+    let sensor_noise = |i: usize, x: usize, y: usize| {
+        let mixed =
+            (i.wrapping_mul(0x9e37_79b9) ^ x.wrapping_mul(0x85eb_ca6b) ^ y.wrapping_mul(0xc2b2_ae35)) as u32;
+        let scrambled = (mixed ^ mixed >> 15).wrapping_mul(0x2c1b_3c6d);
+        (scrambled >> 8) as f32 / (1 << 23) as f32 - 1.0
+    };
+    let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.001 };
+    let mut agent = agent();
+    let mut opened = 0;
+    for i in 0..10_000 {
+        let depth = Image::from_fn(frame.depth_m.width(), frame.depth_m.height(), |x, y| {
+            frame.depth_m[(x, y)] * (1.0 + 0.002 * sensor_noise(i, x, y))
+        });
+        let now = RgbdFrame::new(i as u64, frame.stamp, frame.camera, noise, frame.color.clone(), depth);
+        let outcome = take(&mut agent, &Arc::new(now.unwrap()));
+        opened += outcome.events.iter().filter(|e| matches!(e, Event::SubmapOpened(..))).count();
+        let (metres, radians) = se3::distance(&Default::default(), &outcome.pose.unwrap().agent_from_camera);
+        assert!(metres < 0.05 && radians < 0.02, "frame {i}: {metres} m, {radians} rad from where it stands");
+    }
+    assert_eq!(opened, 1);
+    let surfels = agent.active_submap().unwrap().2.len();
+    let pixels = frame.depth_m.width() * frame.depth_m.height();
+    assert!(surfels < pixels / 2, "{surfels} surfels for {pixels} pixels");
+}
+
+#[test]
+fn a_covered_camera_is_lost_within_3_frames_and_harms_nothing() {
+    let frames = frames(60, 160, None);
+    let mut agent = agent();
+    for frame in &frames[..30] {
+        assert_eq!(take(&mut agent, frame).state, State::Tracking);
+    }
+    let before = agent.active_submap().unwrap().2.clone();
+    let mut closed = None;
+    for (k, frame) in frames[30..40].iter().enumerate() {
+        let outcome = take(&mut agent, &black(frame));
+        assert!(outcome.pose.is_none() && outcome.mapped.added == 0, "covered frame {k}");
+        assert!(k < 2 || matches!(outcome.state, State::Lost(_)), "covered frame {k}: {:?}", outcome.state);
+        for event in outcome.events {
+            match event {
+                Event::SubmapClosed(_, surfels) => closed = Some(surfels),
+                event => panic!("covered frame {k}: {event:?}"),
+            }
+        }
+    }
+    // What was mapped is what was there, less what closing prunes.
+    let closed = closed.unwrap();
+    assert!(closed.iter().all(|s| before.center_m.contains(&s.center_m)));
+    assert!(closed.len() * 10 > before.len() * 9);
+    // It sees again, in the place where it was covered: found there, in the same chain.
+    let outcome = take(&mut agent, &frames[30]);
+    assert_eq!(outcome.state, State::Tracking);
+    assert!(outcome.events.iter().any(|e| matches!(e, Event::Odometry(_))));
+    for frame in &frames[31..] {
+        assert_eq!(take(&mut agent, frame).state, State::Tracking);
+    }
+}
+
+#[test]
+fn a_camera_that_jumps_is_lost_and_begins_another_chain() {
+    let frames = frames(200, 160, None);
+    let mut agent = agent();
+    for frame in &frames[..20] {
+        take(&mut agent, frame);
+    }
+    let mut chains = Vec::new();
+    let mut lost = 0;
+    for frame in &frames[180..200] {
+        let outcome = take(&mut agent, frame);
+        lost += matches!(outcome.state, State::Lost(_)) as usize;
+        chains.extend(outcome.events.iter().filter_map(|event| match event {
+            Event::SubmapOpened(opened, _) => Some(opened.chain),
+            _ => None,
+        }));
+    }
+    assert!((1..=3).contains(&lost), "lost for {lost} frames");
+    assert_eq!(chains, [1]);
+}
+
+#[test]
+fn poses_and_maps_are_the_same_bits_with_one_thread_and_two() {
+    let frames = frames(45, 160, Some(SensorNoise::default()));
+    let on = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| {
+            let mut agent = agent();
+            let (mut poses, mut maps) = (Vec::new(), Vec::new());
+            let mut keep = |events: Vec<Event>| {
+                for event in events {
+                    if let Event::SubmapClosed(_, surfels) = event {
+                        maps.push(surfels);
+                    }
+                }
+            };
+            for frame in &frames {
+                let outcome = take(&mut agent, frame);
+                let pose = outcome.pose.unwrap().agent_from_camera;
+                poses.push(pose.to_homogeneous().map(f64::to_bits));
+                keep(outcome.events);
+            }
+            keep(agent.finish());
+            (poses, maps)
+        })
+    };
+    let (one, two) = (on(1), on(2));
+    assert!(one.0 == two.0, "poses differ");
+    assert!(one.1.len() >= 2 && one.1 == two.1, "maps differ");
+}
