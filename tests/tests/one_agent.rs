@@ -1,10 +1,10 @@
 //! One agent alone, without a network: it is lost and found again, and gives the same bits.
 
-use coma_dataset::sequence::rgbd_frame;
+use coma_dataset::sequence::{Sequence, rgbd_frame};
 use coma_dataset::world::{SensorNoise, World, WorldSettings};
-use coma_frame::{Image, RgbdFrame};
-use coma_geometry::{AgentId, Epoch};
-use coma_slam::agent::{Agent, Event, FrameOptions, FrameOutcome, SlamSettings};
+use coma_frame::{DepthNoise, Image, RgbdFrame};
+use coma_geometry::{AgentId, Epoch, se3};
+use coma_slam::agent::{Agent, Event, FrameOptions, FrameOutcome, Located, SlamSettings};
 use coma_slam::tracking::State;
 use std::sync::Arc;
 
@@ -84,6 +84,86 @@ fn a_camera_that_jumps_is_lost_and_begins_another_chain() {
     }
     assert!((1..=3).contains(&lost), "lost for {lost} frames");
     assert_eq!(chains, [1]);
+}
+
+#[test]
+fn wherever_it_jumps_to_it_is_not_sure_of_a_false_pose() {
+    let world = WorldSettings {
+        agents: 1,
+        frames: 400,
+        width: 160,
+        height: 120,
+        noise: Some(SensorNoise::default()),
+        ..WorldSettings::default()
+    };
+    let sequence = World::new(world).unwrap().sequence(0).unwrap();
+    let frame = |index| rgbd_frame(&sequence, index).unwrap();
+    let truth = |index| sequence.truth(index).unwrap();
+    let mut agent = agent();
+    for index in 0..30 {
+        take(&mut agent, &Arc::new(frame(index)));
+    }
+    let mut lost = 0;
+    for index in (35..400).step_by(5) {
+        match agent.locate(&frame(index)) {
+            Located::Lost(_) => lost += 1,
+            Located::Tracked(_, found) => {
+                let (metres, radians) =
+                    se3::distance(&found.agent_from_camera, &truth(0).inv_mul(&truth(index)));
+                let off = se3::log(&found.agent_from_camera.inv_mul(&truth(0).inv_mul(&truth(index))));
+                // A view that leaves a direction open is one thing, to be sure of it another.
+                let sigmas_squared = off.dot(&found.covariance.cholesky().unwrap().solve(&off));
+                assert!(sigmas_squared < 80.0, "frame {index}: {off:?} off, {sigmas_squared}");
+            }
+            Located::Nowhere(_) => panic!("it has a map"),
+        }
+    }
+    assert!(lost > 30, "lost {lost} times");
+}
+
+/// `count` frames of a camera that stands still, with depth noise.
+fn stand_still(count: usize, width: u32) {
+    let height = width * 3 / 4;
+    let world =
+        WorldSettings { agents: 1, frames: 1, width, height, noise: None, ..WorldSettings::default() };
+    let frame = rgbd_frame(&World::new(world).unwrap().sequence(0).unwrap(), 0).unwrap();
+    let sensor_noise = |i: usize, x: usize, y: usize| {
+        let mixed =
+            (i.wrapping_mul(0x9e37_79b9) ^ x.wrapping_mul(0x85eb_ca6b) ^ y.wrapping_mul(0xc2b2_ae35)) as u32;
+        let scrambled = (mixed ^ mixed >> 15).wrapping_mul(0x2c1b_3c6d);
+        (scrambled >> 8) as f32 / (1 << 23) as f32 - 1.0
+    };
+    let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.001 };
+    let mut agent = agent();
+    let mut opened = 0;
+    for i in 0..count {
+        let depth = Image::from_fn(frame.depth_m.width(), frame.depth_m.height(), |x, y| {
+            frame.depth_m[(x, y)] * (1.0 + 0.002 * sensor_noise(i, x, y))
+        });
+        let now = RgbdFrame::new(i as u64, frame.stamp, frame.camera, noise, frame.color.clone(), depth);
+        let outcome = take(&mut agent, &Arc::new(now.unwrap()));
+        opened += outcome.events.iter().filter(|e| matches!(e, Event::SubmapOpened(..))).count();
+        let (metres, radians) = se3::distance(&Default::default(), &outcome.pose.unwrap().agent_from_camera);
+        assert!(
+            metres < 0.01 && radians < 0.005,
+            "frame {i}: {metres} m, {radians} rad from where it stands"
+        );
+    }
+    assert_eq!(opened, 1);
+    let surfels = agent.active_submap().unwrap().2.len();
+    let pixels = frame.depth_m.width() * frame.depth_m.height();
+    assert!(surfels < pixels / 2, "{surfels} surfels for {pixels} pixels");
+}
+
+#[test]
+fn a_camera_that_stands_still_for_500_frames_makes_no_new_submap() {
+    stand_still(500, 160);
+}
+
+#[test]
+#[ignore = "takes minutes"]
+fn nor_does_one_that_stands_still_for_10000() {
+    stand_still(10_000, 160);
 }
 
 #[test]

@@ -114,27 +114,27 @@ fn measure(
     threads: usize,
     arguments: &Arguments,
 ) -> Row {
-    let views = [SubmapView { surfels: cloud, camera_from_submap: Pose::identity() }];
+    let views = [SubmapView::new(cloud, Pose::identity())];
     let settings = RenderSettings::default();
     let forward = |outputs| render_only(&views, camera, &settings, None, outputs);
     let [mut project, mut sort, mut tile, mut blend, mut back, mut step, mut processor, mut all] =
         [const { Vec::new() }; 8];
-    let first = forward(Outputs::OPTIMISING);
+    let first = forward(Outputs::Optimising);
     let pixels = derivatives(&first);
     for _ in 0..arguments.repeats.max(1) {
         let projected = timed(&mut project, || Projection::of(&views, camera, &settings));
         let sorted = timed(&mut sort, || projected.sort());
         let tiled = timed(&mut tile, || sorted.tile());
-        let rendering = timed(&mut blend, || tiled.blend(None, Outputs::OPTIMISING));
+        let rendering = timed(&mut blend, || tiled.blend(None, Outputs::Optimising));
         timed(&mut back, || backward(&views, camera, &settings, &rendering, &pixels));
         drop(rendering);
         let before_ms = process_ms();
         timed(&mut step, || {
-            let rendering = forward(Outputs::OPTIMISING);
+            let rendering = forward(Outputs::Optimising);
             backward(&views, camera, &settings, &rendering, &pixels)
         });
         processor.push(process_ms() - before_ms);
-        timed(&mut all, || forward(Outputs::ALL));
+        timed(&mut all, || forward(Outputs::All));
     }
     Row {
         scene,

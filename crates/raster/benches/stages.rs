@@ -12,7 +12,7 @@ fn stages(criterion: &mut Criterion) {
     for (name, cloud) in
         [("scattered", scene::scattered(&camera, 100_000, 11.0, 1)), ("surface", scene::surface(&camera, 1))]
     {
-        let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+        let views = [SubmapView::new(&cloud, Pose::identity())];
         let projected = || Projection::of(&views, &camera, &settings);
         let mut group = criterion.benchmark_group(name);
         group.sample_size(20);
@@ -21,7 +21,7 @@ fn stages(criterion: &mut Criterion) {
         group.bench_function("tile", |b| {
             b.iter_batched(|| projected().sort(), |p| p.tile(), BatchSize::LargeInput)
         });
-        for (name, outputs) in [("blend", Outputs::ALL), ("blend for losses", Outputs::OPTIMISING)] {
+        for (name, outputs) in [("blend", Outputs::All), ("blend for losses", Outputs::Optimising)] {
             group.bench_function(name, |b| {
                 b.iter_batched(
                     || projected().sort().tile(),
@@ -30,7 +30,7 @@ fn stages(criterion: &mut Criterion) {
                 )
             });
         }
-        let rendering = render_only(&views, &camera, &settings, None, Outputs::OPTIMISING);
+        let rendering = render_only(&views, &camera, &settings, None, Outputs::Optimising);
         let pixels = PixelGradients {
             color: rendering.color.map(|c| c.map(|v| v - 0.4)),
             depth_m: rendering.depth_m.map(|d| 0.01 * (d - 2.0)),

@@ -11,6 +11,7 @@ pub(crate) struct Bands<'a> {
     depth: ChunksMut<'a, f32>,
     median: ChunksMut<'a, f32>,
     surface: ChunksMut<'a, f32>,
+    intensity: ChunksMut<'a, f32>,
     spread: ChunksMut<'a, f32>,
     opacity: ChunksMut<'a, f32>,
     normal: ChunksMut<'a, [f32; 3]>,
@@ -24,6 +25,7 @@ pub(crate) struct Band<'a> {
     depth: &'a mut [f32],
     median: &'a mut [f32],
     surface: &'a mut [f32],
+    intensity: &'a mut [f32],
     spread: &'a mut [f32],
     opacity: &'a mut [f32],
     normal: &'a mut [[f32; 3]],
@@ -41,6 +43,7 @@ impl<'a> Bands<'a> {
             depth: out.depth_m.pixels_mut().chunks_mut(size),
             median: out.median_depth_m.pixels_mut().chunks_mut(size),
             surface: out.surface_depth_m.pixels_mut().chunks_mut(size),
+            intensity: out.surface_intensity.pixels_mut().chunks_mut(size),
             spread: out.depth_spread_m.pixels_mut().chunks_mut(size),
             opacity: out.opacity.pixels_mut().chunks_mut(size),
             normal: out.normal.pixels_mut().chunks_mut(size),
@@ -55,6 +58,7 @@ impl<'a> Bands<'a> {
             depth: self.depth.next().unwrap_or_default(),
             median: self.median.next().unwrap_or_default(),
             surface: self.surface.next().unwrap_or_default(),
+            intensity: self.intensity.next().unwrap_or_default(),
             spread: self.spread.next().unwrap_or_default(),
             opacity: self.opacity.next().unwrap_or_default(),
             normal: self.normal.next().unwrap_or_default(),
@@ -71,6 +75,7 @@ impl Band<'_> {
         place.write(self.depth, |i| tile.depth[i]);
         place.write(self.median, |i| tile.median[i]);
         place.write(self.surface, |i| tile.surface[i]);
+        place.write(self.intensity, |i| tile.intensity[i]);
         place.write(self.spread, |i| tile.spread[i]);
         place.write(self.opacity, |i| tile.opacity[i]);
         let triple = |images: &[TileImage; 3], i: usize| [images[0][i], images[1][i], images[2][i]];

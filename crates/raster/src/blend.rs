@@ -21,6 +21,8 @@ pub(crate) struct TileImages {
     pub opacity: TileImage,
     pub median: TileImage,
     pub surface: TileImage,
+    /// Of the front surface.
+    pub intensity: TileImage,
     pub spread: TileImage,
     /// Unit length, or zero.
     pub normal: [TileImage; 3],
@@ -38,6 +40,7 @@ impl TileImages {
             opacity: zero,
             median: zero,
             surface: zero,
+            intensity: zero,
             spread: zero,
             normal: [zero; 3],
             near: zero,
@@ -87,9 +90,11 @@ impl TileSurfels {
     }
 }
 
-/// Blends a tile. `DETAIL`: median, surface and spread of depth. `NORMAL`: normals. `GROWTH`: looks for surfels near the
-/// observed depth, in front or hidden.
-pub(crate) struct Blend<'a, const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> {
+/// Blends a tile. `BLENDED`: colour and expected depth. `SURFACE`: depth and intensity of the front surface. `DETAIL`:
+/// median and spread of depth, and normals; needs `BLENDED`. `GROWTH`: looks for surfels near the observed depth, in front
+/// or hidden.
+pub(crate) struct Blend<'a, const BLENDED: bool, const SURFACE: bool, const DETAIL: bool, const GROWTH: bool>
+{
     pub surfels: &'a mut TileSurfels,
     /// The tile's first pixel.
     pub origin: [f32; 2],
@@ -103,8 +108,8 @@ pub(crate) struct Blend<'a, const DETAIL: bool, const NORMAL: bool, const GROWTH
 /// After so many surfels a block looks whether its pixels are done.
 const PATIENCE: usize = 4;
 
-impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
-    for Blend<'_, DETAIL, NORMAL, GROWTH>
+impl<const BLENDED: bool, const SURFACE: bool, const DETAIL: bool, const GROWTH: bool> WithSimd
+    for Blend<'_, BLENDED, SURFACE, DETAIL, GROWTH>
 {
     type Output = ();
 
@@ -124,7 +129,7 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
                 let mut passing = pixels.inside(&constants).select(one, zero);
                 let (mut color, mut normal) = ([zero; 3], [zero; 3]);
                 let (mut depth, mut depth_squared, mut median) = (zero, zero, zero);
-                let (mut surface, mut surface_depth) = (zero, zero);
+                let (mut surface, mut surface_depth, mut surface_intensity) = (zero, zero, zero);
                 let (mut near, mut counted) = (zero, zero);
                 let observed = Lanes::load(simd, &self.observed.depth, at);
                 let tolerance = Lanes::load(simd, &self.observed.tolerance, at);
@@ -147,14 +152,14 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
                     let weight = live.select(hit.alpha * passing, zero);
                     let after = passing - weight;
                     counted = counted + live.select(one, zero);
-                    for c in 0..3 {
-                        color[c] = weight.mul_add(number(p.color[c]), color[c]);
-                    }
                     let weighted_depth = weight * hit.depth;
-                    depth = depth + weighted_depth;
-                    if DETAIL {
-                        depth_squared = weighted_depth.mul_add(hit.depth, depth_squared);
-                        median = half.less(passing).and(after.at_most(half)).select(hit.depth, median);
+                    if BLENDED {
+                        for c in 0..3 {
+                            color[c] = weight.mul_add(number(p.color[c]), color[c]);
+                        }
+                        depth = depth + weighted_depth;
+                    }
+                    if SURFACE {
                         // One surface is what lies together; the first that outweighs what came before it counts.
                         let alpha = live.select(hit.alpha, zero);
                         let gap = hit.depth.mul_add(surface, zero - surface_depth).abs();
@@ -162,9 +167,14 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
                         let outweighs = surface.less(alpha);
                         let (joined, own) = (alpha.mul_add(hit.depth, surface_depth), alpha * hit.depth);
                         surface_depth = joins.select(joined, outweighs.select(own, surface_depth));
+                        let shade = alpha * number(p.intensity);
+                        let shades = surface_intensity + shade;
+                        surface_intensity = joins.select(shades, outweighs.select(shade, surface_intensity));
                         surface = joins.select(surface + alpha, outweighs.select(alpha, surface));
                     }
-                    if NORMAL {
+                    if DETAIL {
+                        depth_squared = weighted_depth.mul_add(hit.depth, depth_squared);
+                        median = half.less(passing).and(after.at_most(half)).select(hit.depth, median);
                         // The normal that faces the camera: its plane's offset is negative.
                         let facing = if p.k > 0.0 { -1.0 } else { 1.0 };
                         for c in 0..3 {
@@ -183,18 +193,22 @@ impl<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool> WithSimd
                 let share = covered.select(one / opacity, zero);
                 let expected = depth * share;
                 opacity.store(&mut out.opacity, at);
-                expected.store(&mut out.depth, at);
-                for c in 0..3 {
-                    color[c].store(&mut out.color[c], at);
+                if BLENDED {
+                    expected.store(&mut out.depth, at);
+                    for c in 0..3 {
+                        color[c].store(&mut out.color[c], at);
+                    }
+                }
+                if SURFACE {
+                    let found = zero.less(surface);
+                    let share = found.select(one / surface, zero);
+                    (surface_depth * share).store(&mut out.surface, at);
+                    (surface_intensity * share).store(&mut out.intensity, at);
                 }
                 if DETAIL {
                     let variance = depth_squared * share - expected * expected;
                     variance.max(zero).sqrt().store(&mut out.spread, at);
                     median.store(&mut out.median, at);
-                    let found = zero.less(surface);
-                    found.select(surface_depth / surface, zero).store(&mut out.surface, at);
-                }
-                if NORMAL {
                     let squared =
                         normal[0].mul_add(normal[0], normal[1].mul_add(normal[1], normal[2] * normal[2]));
                     let length = squared.sqrt();

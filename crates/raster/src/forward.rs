@@ -49,7 +49,7 @@ pub fn render(
     settings: &RenderSettings,
     growth: Option<&GrowthTest<'_>>,
 ) -> Rendering {
-    render_only(submaps, camera, settings, growth, Outputs::ALL)
+    render_only(submaps, camera, settings, growth, Outputs::All)
 }
 
 /// As [`render`], without the images that are not wanted.
@@ -172,13 +172,14 @@ fn empty(camera: &Intrinsics, growth: bool, outputs: Outputs) -> Rendering {
     let number = |wanted: bool| Image::filled(size(wanted).0, size(wanted).1, 0.0f32);
     let triple = |wanted: bool| Image::filled(size(wanted).0, size(wanted).1, [0.0f32; 3]);
     Rendering {
-        color: triple(true),
-        depth_m: number(true),
-        median_depth_m: number(outputs.depth_detail),
-        surface_depth_m: number(outputs.depth_detail),
-        depth_spread_m: number(outputs.depth_detail),
+        color: triple(outputs.blended()),
+        depth_m: number(outputs.blended()),
+        median_depth_m: number(outputs.detail()),
+        surface_depth_m: number(outputs.surface()),
+        surface_intensity: number(outputs.surface()),
+        depth_spread_m: number(outputs.detail()),
         opacity: number(true),
-        normal: triple(outputs.normal),
+        normal: triple(outputs.detail()),
         near_surface: growth.then(|| Image::filled(size(true).0, size(true).1, false)),
         hits: 0,
         state: RenderState {
@@ -210,7 +211,7 @@ impl Scratch {
 type Kernel = fn(Arch, &mut Scratch, [f32; 2], &Intrinsics, &RenderSettings);
 
 fn kernel(outputs: Outputs, growth: bool) -> Kernel {
-    fn run<const DETAIL: bool, const NORMAL: bool, const GROWTH: bool>(
+    fn run<const BLENDED: bool, const SURFACE: bool, const DETAIL: bool, const GROWTH: bool>(
         arch: Arch,
         scratch: &mut Scratch,
         origin: [f32; 2],
@@ -218,16 +219,22 @@ fn kernel(outputs: Outputs, growth: bool) -> Kernel {
         settings: &RenderSettings,
     ) {
         let Scratch { surfels, observed, images: out } = scratch;
-        arch.dispatch(Blend::<DETAIL, NORMAL, GROWTH> { surfels, origin, camera, settings, observed, out });
+        let observed = &*observed;
+        arch.dispatch(Blend::<BLENDED, SURFACE, DETAIL, GROWTH> {
+            surfels,
+            origin,
+            camera,
+            settings,
+            observed,
+            out,
+        });
     }
-    match (outputs.depth_detail, outputs.normal, growth) {
-        (false, false, false) => run::<false, false, false>,
-        (false, false, true) => run::<false, false, true>,
-        (false, true, false) => run::<false, true, false>,
-        (false, true, true) => run::<false, true, true>,
-        (true, false, false) => run::<true, false, false>,
-        (true, false, true) => run::<true, false, true>,
-        (true, true, false) => run::<true, true, false>,
-        (true, true, true) => run::<true, true, true>,
+    match (outputs, growth) {
+        (Outputs::All, false) => run::<true, true, true, false>,
+        (Outputs::All, true) => run::<true, true, true, true>,
+        (Outputs::Tracking, false) => run::<false, true, false, false>,
+        (Outputs::Tracking, true) => run::<false, true, false, true>,
+        (Outputs::Optimising, false) => run::<true, false, false, false>,
+        (Outputs::Optimising, true) => run::<true, false, false, true>,
     }
 }

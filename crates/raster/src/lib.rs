@@ -38,12 +38,22 @@ pub struct SubmapView<'a> {
     pub surfels: &'a SurfelCloud,
     /// Takes the submap's points to the camera.
     pub camera_from_submap: Pose,
+    /// What the surfels' intensity is taken for, one for each, 0..1: for [`Rendering::surface_intensity`] alone. Without
+    /// it that of their colour.
+    pub intensity: Option<&'a [f32]>,
+}
+
+impl<'a> SubmapView<'a> {
+    /// With the intensity of the surfels' colours.
+    pub fn new(surfels: &'a SurfelCloud, camera_from_submap: Pose) -> Self {
+        SubmapView { surfels, camera_from_submap, intensity: None }
+    }
 }
 
 /// What a camera would see. Images are `[height, width]`; those that were not asked for are empty.
 #[derive(Debug)]
 pub struct Rendering {
-    /// Blended colour over black.
+    /// Blended colour over black, 0..1.
     pub color: Image<[f32; 3]>,
     /// Expected depth D / A, metres; 0 where nothing was hit.
     pub depth_m: Image<f32>,
@@ -52,6 +62,10 @@ pub struct Rendering {
     /// Mean depth of the front surface's hits by their alpha alone, metres; 0 where nothing was hit. Expected depth
     /// is drawn towards the camera, as nearer surfels of one surface hide those behind; this is not.
     pub surface_depth_m: Image<f32>,
+    /// Mean intensity of the front surface's hits by their alpha alone, 0..1. Blended colour at a pixel is mostly that of
+    /// the nearest surfel that reaches it, so that what is painted on an inclined surface is drawn away from the camera;
+    /// this is not.
+    pub surface_intensity: Image<f32>,
     /// Standard deviation of depth within the blend, metres.
     pub depth_spread_m: Image<f32>,
     /// A, 0..1.

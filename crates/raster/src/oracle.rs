@@ -34,6 +34,8 @@ pub struct OraclePixel {
     pub median: f64,
     /// Mean depth of the front surface's hits.
     pub surface: f64,
+    /// Mean intensity of the front surface's hits.
+    pub surface_intensity: f64,
 }
 
 /// The surfels of all submaps in the camera's frame.
@@ -99,7 +101,7 @@ fn pixel(
     settings: &RenderSettings,
 ) -> OraclePixel {
     let (mut passing, mut depth_sum) = (1.0f64, 0.0f64);
-    let (mut surface, mut surface_sum) = (0.0f64, 0.0f64);
+    let (mut surface, mut surface_sum, mut shades) = (0.0f64, 0.0f64, 0.0f64);
     let mut out = OraclePixel::default();
     for s in order {
         let (alpha, depth) = hit(s, x, y, camera, settings);
@@ -117,15 +119,18 @@ fn pixel(
         }
         let together =
             (depth * surface - surface_sum).abs() <= settings.surface_relative as f64 * depth * surface;
+        let shade = alpha * (0.299 * s.color[0] + 0.587 * s.color[1] + 0.114 * s.color[2]);
         if together {
-            (surface, surface_sum) = (surface + alpha, surface_sum + alpha * depth);
+            (surface, surface_sum, shades) = (surface + alpha, surface_sum + alpha * depth, shades + shade);
         } else if surface < alpha {
-            (surface, surface_sum) = (alpha, alpha * depth);
+            (surface, surface_sum, shades) = (alpha, alpha * depth, shade);
         }
         passing = after;
     }
     out.opacity = 1.0 - passing;
-    out.surface = if surface > 0.0 { surface_sum / surface } else { 0.0 };
+    if surface > 0.0 {
+        (out.surface, out.surface_intensity) = (surface_sum / surface, shades / surface);
+    }
     out.depth = if out.opacity > 0.0 { depth_sum / out.opacity } else { 0.0 };
     out
 }

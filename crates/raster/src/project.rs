@@ -21,6 +21,7 @@ pub(crate) struct Projected {
     pub z: f32,
     pub opacity: f32,
     pub color: [f32; 3],
+    pub intensity: f32,
 }
 
 /// All surfels of all submaps in one row, each at its slot: submap after submap, in their own order.
@@ -120,9 +121,12 @@ fn project_one(
     settings: &RenderSettings,
 ) -> Option<(Projected, Reach)> {
     let (opacity, color) = (view.surfels.opacity[index], view.surfels.color[index]);
+    let given = view.intensity.and_then(|all| all.get(index)).copied();
+    let intensity = given.unwrap_or(0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]);
     let s = InCamera::of(view, pose, index);
     let z = s.center.z;
-    let finite = s.center.iter().chain(s.axes.iter()).chain(&s.scale).chain(&color).all(|v| v.is_finite());
+    let geometry = s.center.iter().chain(s.axes.iter()).chain(&s.scale);
+    let finite = geometry.chain(&color).chain([&intensity]).all(|v| v.is_finite());
     let usable = z > settings.near_m && s.scale[0] > 0.0 && s.scale[1] > 0.0 && opacity > settings.alpha_min;
     if !(finite && usable && opacity <= 1.0) {
         return None;
@@ -140,5 +144,5 @@ fn project_one(
     if !a.iter().chain(&b).all(|v| v.is_finite()) {
         return None;
     }
-    Some((Projected { a: a.into(), b: b.into(), n: n.into(), k, pixel, z, opacity, color }, reach))
+    Some((Projected { a: a.into(), b: b.into(), n: n.into(), k, pixel, z, opacity, color, intensity }, reach))
 }

@@ -170,7 +170,7 @@ mod tests {
     fn compare(cloud: &SurfelCloud, shrink: f32) -> (usize, usize, usize) {
         let camera = scene::camera(96, 64);
         let settings = RenderSettings::default();
-        let views = [SubmapView { surfels: cloud, camera_from_submap: Pose::identity() }];
+        let views = [SubmapView::new(cloud, Pose::identity())];
         let mut found = project(&views, &camera, &settings);
         let (mut missed, mut needed, mut named) = (0, 0, 0);
         for (slot, surfel) in oracle::in_camera(&views).iter().enumerate() {

@@ -54,23 +54,32 @@ pub struct GrowthTest<'a> {
     pub relative: f32,
 }
 
-/// Which images a rendering holds besides colour, expected depth, opacity and the growth test; the others are
-/// left empty (0 x 0).
+/// Which images a rendering holds besides opacity and the growth test; the others are left empty (0 x 0).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Outputs {
-    /// Median, surface and spread of depth.
-    pub depth_detail: bool,
-    /// Normals.
-    pub normal: bool,
+pub enum Outputs {
+    /// Everything.
+    All,
+    /// What a frame is tracked against: the front surface's depth and intensity.
+    Tracking,
+    /// What losses are made of, and all that [`crate::backward`] needs: blended colour and expected depth.
+    Optimising,
 }
 
 impl Outputs {
-    /// Everything.
-    pub const ALL: Outputs = Outputs { depth_detail: true, normal: true };
-    /// What a frame is tracked against: depth that can be judged.
-    pub const TRACKING: Outputs = Outputs { depth_detail: true, normal: false };
-    /// What losses are made of, and all that [`crate::backward`] needs.
-    pub const OPTIMISING: Outputs = Outputs { depth_detail: false, normal: false };
+    /// Blended colour and expected depth.
+    pub const fn blended(self) -> bool {
+        !matches!(self, Outputs::Tracking)
+    }
+
+    /// Depth and intensity of the front surface.
+    pub const fn surface(self) -> bool {
+        !matches!(self, Outputs::Optimising)
+    }
+
+    /// Median and spread of depth, and normals.
+    pub const fn detail(self) -> bool {
+        matches!(self, Outputs::All)
+    }
 }
 
 /// Observed depth and tolerance of one tile's pixels.

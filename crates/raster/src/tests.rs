@@ -69,10 +69,7 @@ fn worst_difference(rendering: &Rendering, oracle: &[OraclePixel]) -> (f64, usiz
 #[test]
 fn the_oracle_agrees_everywhere() {
     let (one, two) = (surfels(1, 60), surfels(2, 40));
-    let views = [
-        SubmapView { surfels: &one, camera_from_submap: Pose::identity() },
-        SubmapView { surfels: &two, camera_from_submap: pose() },
-    ];
+    let views = [SubmapView::new(&one, Pose::identity()), SubmapView::new(&two, pose())];
     for settings in [smooth(), RenderSettings::default()] {
         let rendering = render(&views, &CAMERA, &settings, None);
         let oracle = oracle::render(&oracle::in_camera(&views), &CAMERA, &settings);
@@ -85,7 +82,8 @@ fn the_oracle_agrees_everywhere() {
         }
         let other = |(i, o): &(usize, &OraclePixel)| {
             let found = rendering.surface_depth_m.pixels()[*i] as f64;
-            (found - o.surface).abs() > 1e-3
+            let shade = rendering.surface_intensity.pixels()[*i] as f64;
+            (found - o.surface).abs() > 1e-3 || (shade - o.surface_intensity).abs() > 1e-3
         };
         // A hit may fall to either of two surfaces.
         let others = oracle.iter().enumerate().filter(other).count();
@@ -96,10 +94,10 @@ fn the_oracle_agrees_everywhere() {
 #[test]
 fn the_harness_sees_a_surfel_that_is_missing_or_moved() {
     let mut cloud = surfels(1, 60);
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+    let views = [SubmapView::new(&cloud, Pose::identity())];
     let oracle = oracle::render(&oracle::in_camera(&views), &CAMERA, &smooth());
     cloud.center_m[7][0] += 0.01;
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+    let views = [SubmapView::new(&cloud, Pose::identity())];
     let rendering = render(&views, &CAMERA, &smooth(), None);
     let (worst, off) = worst_difference(&rendering, &oracle);
     assert!(worst > 5e-3 && off > 8, "{worst}, {off} pixels off");
@@ -168,10 +166,7 @@ fn small_scene() -> (SurfelCloud, SurfelCloud) {
 #[test]
 fn gradients_of_every_surfel_parameter_agree_with_differences() {
     let (one, two) = small_scene();
-    let views = [
-        SubmapView { surfels: &one, camera_from_submap: Pose::identity() },
-        SubmapView { surfels: &two, camera_from_submap: pose() },
-    ];
+    let views = [SubmapView::new(&one, Pose::identity()), SubmapView::new(&two, pose())];
     let rendering = render(&views, &CAMERA, &smooth(), None);
     let gradients = backward(&views, &CAMERA, &smooth(), &rendering, &pixel_gradients());
     let base = oracle::in_camera(&views);
@@ -205,10 +200,7 @@ fn gradients_of_every_surfel_parameter_agree_with_differences() {
 #[test]
 fn the_gradient_of_the_camera_s_pose_agrees_with_differences() {
     let (one, two) = small_scene();
-    let views = [
-        SubmapView { surfels: &one, camera_from_submap: Pose::identity() },
-        SubmapView { surfels: &two, camera_from_submap: pose() },
-    ];
+    let views = [SubmapView::new(&one, Pose::identity()), SubmapView::new(&two, pose())];
     let rendering = render(&views, &CAMERA, &smooth(), None);
     let gradients = backward(&views, &CAMERA, &smooth(), &rendering, &pixel_gradients());
     let base = oracle::in_camera(&views);
@@ -237,7 +229,7 @@ fn growth_sees_a_surfel_only_near_the_observed_depth() {
         color: [0.5; 3],
     };
     let cloud: SurfelCloud = [wall].into_iter().collect();
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+    let views = [SubmapView::new(&cloud, Pose::identity())];
     let near = |observed: f32| {
         let depth = Image::filled(44, 36, observed);
         let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.002 };
@@ -261,7 +253,7 @@ fn depth_along_a_tilted_surfel_is_that_of_the_ray_s_hit() {
         color: [1.0; 3],
     };
     let cloud: SurfelCloud = [disc].into_iter().collect();
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+    let views = [SubmapView::new(&cloud, Pose::identity())];
     let rendering = render(&views, &CAMERA, &RenderSettings::default(), None);
     let normal = tilt * Vector3::z();
     let ray = CAMERA.ray(28.0, 17.0).cast::<f32>();
@@ -290,7 +282,7 @@ fn a_hidden_surfel_near_the_observed_depth_is_known() {
         color: [0.5; 3],
     };
     let cloud: SurfelCloud = [1.0, 1.1, 1.2, 1.3, 2.0].map(wall).into_iter().collect();
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+    let views = [SubmapView::new(&cloud, Pose::identity())];
     let depth = Image::filled(44, 36, 2.0f32);
     let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.002 };
     let test = GrowthTest { observed_depth_m: &depth, noise, sigma_factor: 3.0, relative: 0.01 };

@@ -14,7 +14,10 @@ use crate::mapping::submap::{ActiveSubmap, MappedFrame, MappingSettings};
 use crate::odometry;
 use crate::tracking::align::Brightness;
 use crate::tracking::view::TrackingView;
-use crate::tracking::{self, Reason, State, Tracked, TrackingSettings, model::Model};
+use crate::tracking::{
+    self, Reason, State, Tracked, TrackingSettings,
+    model::{Model, Part},
+};
 use coma_frame::RgbdFrame;
 use coma_geometry::{AgentId, Epoch, Matrix6, Pose, StampNs, SubmapId};
 use coma_raster::RenderSettings;
@@ -75,6 +78,8 @@ pub struct FrameOutcome {
     pub events: Vec<Event>,
     /// Share of the pixels with depth that fit the map.
     pub share: f64,
+    /// Of what the frame and the map both show, the share that fits.
+    pub agreement: f64,
     /// What mapping did.
     pub mapped: MappedFrame,
 }
@@ -122,6 +127,8 @@ pub struct Recent {
     pub chain: u32,
     /// Its surfels.
     pub surfels: Arc<SurfelCloud>,
+    /// As it was measured, one for each surfel; without it that of their colour.
+    pub intensity: Option<Vec<f32>>,
     /// By odometry.
     pub agent_from_submap: Pose,
 }
@@ -257,8 +264,16 @@ impl Agent {
     }
 
     fn model(&self) -> Model<'_> {
-        let recent = self.recent.iter().map(|r| (&*r.surfels, r.agent_from_submap));
-        let active = self.active.iter().map(|a| (&a.surfels, a.agent_from_submap));
+        let recent = self.recent.iter().map(|r| Part {
+            surfels: &r.surfels,
+            intensity: r.intensity.as_deref(),
+            agent_from_submap: r.agent_from_submap,
+        });
+        let active = self.active.iter().map(|a| Part {
+            surfels: &a.surfels,
+            intensity: Some(&a.measured.intensity),
+            agent_from_submap: a.agent_from_submap,
+        });
         Model { submaps: recent.chain(active).collect(), render: &self.settings.render }
     }
 
@@ -274,6 +289,7 @@ impl Agent {
             brightness: self.brightness,
             covariance: Matrix6::zeros(),
             share: 1.0,
+            agreement: 1.0,
             map_at_once: false,
             hits: 0,
         };
@@ -339,13 +355,18 @@ impl Agent {
         };
         self.last_pose = tracked.agent_from_camera;
         self.previous = Some(Previous { view, agent_from_camera: tracked.agent_from_camera, motion });
-        let degraded = self.settings.tracking.degraded_share;
-        let state = if tracked.share < degraded {
-            State::Degraded(vec![Reason::FewFit { share: tracked.share * 100.0, needed: degraded * 100.0 }])
-        } else {
-            State::Tracking
-        };
-        FrameOutcome { state, pose, events, share: tracked.share, mapped }
+        let TrackingSettings { degraded_share, degraded_sigma_m: needed, .. } = self.settings.tracking;
+        let mut reasons = Vec::new();
+        if tracked.share < degraded_share {
+            let (share, needed) = (tracked.share * 100.0, degraded_share * 100.0);
+            reasons.push(Reason::FewFit { share, needed });
+        }
+        let metres = tracked.sigma_m();
+        if metres > needed {
+            reasons.push(Reason::Uncertain { metres, needed });
+        }
+        let state = if reasons.is_empty() { State::Tracking } else { State::Degraded(reasons) };
+        FrameOutcome { state, pose, events, share: tracked.share, agreement: tracked.agreement, mapped }
     }
 
     /// A frame that could not be tracked. The first of a row gets no pose but may still be found again from
@@ -364,7 +385,7 @@ impl Agent {
             self.previous = None;
         }
         let state = if may_recover { State::Degraded(reasons) } else { State::Lost(reasons) };
-        FrameOutcome { state, pose: None, events, share: 0.0, mapped: MappedFrame::default() }
+        FrameOutcome { state, pose: None, events, share: 0.0, agreement: 0.0, mapped: MappedFrame::default() }
     }
 
     /// Opens the submap after the last closed one, in its chain and tied to it.
@@ -406,8 +427,10 @@ impl Agent {
     fn close_active(&mut self) -> Option<Event> {
         let active = self.active.take()?;
         let (id, chain, agent_from_submap) = (active.id.clone(), active.chain, active.agent_from_submap);
-        let surfels = Arc::new(active.close(&self.settings.mapping));
-        self.recent = Some(Recent { id: id.clone(), chain, surfels: surfels.clone(), agent_from_submap });
+        let (surfels, intensity) = active.close(&self.settings.mapping);
+        let (surfels, intensity) = (Arc::new(surfels), Some(intensity));
+        self.recent =
+            Some(Recent { id: id.clone(), chain, surfels: surfels.clone(), intensity, agent_from_submap });
         Some(Event::SubmapClosed(id, surfels))
     }
 }

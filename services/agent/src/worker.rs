@@ -33,7 +33,13 @@ pub fn resume_from(node: &Node, checkpoints: &[Checkpoint]) -> anyhow::Result<Op
     Ok(Some(Resume {
         next_submap: last + 1,
         frames: knowledge.frames,
-        recent: Recent { id, chain: facts.chain, surfels, agent_from_submap: facts.agent_from_submap },
+        recent: Recent {
+            id,
+            chain: facts.chain,
+            surfels,
+            intensity: None,
+            agent_from_submap: facts.agent_from_submap,
+        },
         agent_from_camera: pose.agent_from_camera,
     }))
 }

@@ -60,7 +60,7 @@ pub fn picture(
     let placed: Vec<_> = parts.iter().map(view).collect();
     let views: Vec<SubmapView<'_>> = placed
         .iter()
-        .map(|(camera_from_submap, surfels)| SubmapView { surfels, camera_from_submap: *camera_from_submap })
+        .map(|(camera_from_submap, surfels)| SubmapView::new(surfels, *camera_from_submap))
         .collect();
     let rendering = coma_raster::render(&views, camera, &RenderSettings::default(), None);
     encode(&rendering, output, format)

@@ -147,8 +147,8 @@ fn compare(
     let mut out = Compared::default();
     for (index, agent_from_camera) in picked(found, views) {
         let frame = coma_dataset::sequence::rgbd_frame(&*source.sequence, index)?;
-        let view = SubmapView { surfels: map, camera_from_submap: agent_from_camera.inverse() };
-        let rendering = render_only(&[view], &frame.camera, render, None, Outputs::OPTIMISING);
+        let view = SubmapView::new(map, agent_from_camera.inverse());
+        let rendering = render_only(&[view], &frame.camera, render, None, Outputs::Optimising);
         out.add(&rendering.color, &rendering.depth_m, &frame)?;
     }
     Ok(out.0)

@@ -14,6 +14,7 @@ fn numbers(rendering: &Rendering, gradients: &Gradients) -> Vec<(&'static str, V
         ("near", near.collect()),
         ("median", rendering.median_depth_m.pixels().to_vec()),
         ("surface", rendering.surface_depth_m.pixels().to_vec()),
+        ("intensity", rendering.surface_intensity.pixels().to_vec()),
         ("spread", rendering.depth_spread_m.pixels().to_vec()),
         ("normal", flat(&rendering.normal)),
         ("by centre", of(|g| g.center_m.concat())),
@@ -29,10 +30,7 @@ fn numbers(rendering: &Rendering, gradients: &Gradients) -> Vec<(&'static str, V
 fn run(arch: pulp::Arch, outputs: Outputs) -> (u64, Vec<(&'static str, Vec<f32>)>) {
     let camera = scene::camera(150, 101);
     let (one, two) = (scene::scattered(&camera, 15_000, 9.0, 3), scene::scattered(&camera, 5_000, 3.0, 4));
-    let views = [
-        SubmapView { surfels: &one, camera_from_submap: Pose::identity() },
-        SubmapView { surfels: &two, camera_from_submap: pose() },
-    ];
+    let views = [SubmapView::new(&one, Pose::identity()), SubmapView::new(&two, pose())];
     let settings = RenderSettings::default();
     let depth = Image::from_fn(150, 101, |x, y| 1.0 + ((x * 7 + y * 13) % 31) as f32 * 0.1);
     let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.002 };
@@ -52,7 +50,7 @@ fn run(arch: pulp::Arch, outputs: Outputs) -> (u64, Vec<(&'static str, Vec<f32>)
 fn the_same_bits_come_from_any_number_of_threads() {
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| run(pulp::Arch::new(), Outputs::ALL))
+        pool.install(|| run(pulp::Arch::new(), Outputs::All))
     };
     let one = on(1);
     for threads in [2, 3] {
@@ -78,14 +76,14 @@ fn every_instruction_set_sees_the_same() {
     let [portable, others @ ..] = &crate::architectures()[..] else {
         panic!("there is always the portable one")
     };
-    let truth = run(*portable, Outputs::ALL);
+    let truth = run(*portable, Outputs::All);
     for arch in others {
-        let found = run(*arch, Outputs::ALL);
+        let found = run(*arch, Outputs::All);
         // A hit at the least alpha may fall to either side.
         assert!(found.0.abs_diff(truth.0) <= 20, "{arch:?}: {} hits, {}", found.0, truth.0);
         for ((name, a), (_, b)) in truth.1.iter().zip(&found.1) {
             // The median jumps from one surfel to the next, the surface from one to another, and near is yes or no.
-            let limit = if ["median", "surface", "near"].contains(name) { 0.02 } else { 2e-3 };
+            let limit = if ["median", "surface", "intensity", "near"].contains(name) { 0.02 } else { 2e-3 };
             let found = difference(a, b);
             assert!(found < limit, "{arch:?}: {name} differs by {found}");
         }
@@ -97,14 +95,15 @@ fn every_instruction_set_sees_the_same() {
 
 #[test]
 fn what_is_not_wanted_is_empty_and_changes_nothing_else() {
-    let all = run(pulp::Arch::new(), Outputs::ALL);
-    for outputs in [Outputs::TRACKING, Outputs::OPTIMISING, Outputs { depth_detail: false, normal: true }] {
+    let all = run(pulp::Arch::new(), Outputs::All);
+    for outputs in [Outputs::Tracking, Outputs::Optimising] {
         let some = run(pulp::Arch::new(), outputs);
         assert_eq!(all.0, some.0);
         for ((name, a), (_, b)) in all.1.iter().zip(&some.1) {
             let wanted = match *name {
-                "median" | "surface" | "spread" => outputs.depth_detail,
-                "normal" => outputs.normal,
+                "surface" | "intensity" => outputs.surface(),
+                "median" | "spread" | "normal" => outputs.detail(),
+                "colour" | "depth" => outputs.blended(),
                 _ => true,
             };
             assert!(if wanted { a == b } else { b.is_empty() }, "{name} for {outputs:?}");

@@ -144,8 +144,7 @@ fn a_flat_gaussian_is_a_disc() {
             .collect();
     let settings = RenderSettings::default();
     let camera_from_submap = Pose::identity();
-    let of_disc =
-        crate::render(&[SubmapView { surfels: &disc, camera_from_submap }], &CAMERA, &settings, None);
+    let of_disc = crate::render(&[SubmapView::new(&disc, camera_from_submap)], &CAMERA, &settings, None);
     let of_flat = render(&[GaussianView { gaussians: &flat, camera_from_submap }], &CAMERA, &settings, None);
     for (d, f) in of_disc.opacity.pixels().iter().zip(of_flat.opacity.pixels()) {
         assert!((d - f).abs() < 0.01, "{d} {f}");

@@ -4,7 +4,7 @@ use super::*;
 
 /// Renders and goes backward; everything that comes out is finite.
 fn picture(surfels: &SurfelCloud) -> (Image<[f32; 3]>, SurfelGradients) {
-    let views = [SubmapView { surfels, camera_from_submap: Pose::identity() }];
+    let views = [SubmapView::new(surfels, Pose::identity())];
     let settings = RenderSettings::default();
     let rendering = render(&views, &CAMERA, &settings, None);
     let mut gradients = backward(&views, &CAMERA, &settings, &rendering, &pixel_gradients());
@@ -102,7 +102,7 @@ fn surfels_seen_edge_on_agree_with_the_oracle() {
     };
     let cloud: SurfelCloud =
         [0.0, 1e-6, 1e-3, 0.02].into_iter().cycle().take(40).map(|off| disc(off, &mut r)).collect();
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+    let views = [SubmapView::new(&cloud, Pose::identity())];
     for settings in [smooth(), RenderSettings::default()] {
         let rendering = render(&views, &CAMERA, &settings, None);
         let oracle = oracle::render(&oracle::in_camera(&views), &CAMERA, &settings);

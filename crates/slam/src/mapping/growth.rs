@@ -102,7 +102,7 @@ mod tests {
 
     fn new(rule: GrowthRule, observed_depth_m: &Image<f32>, pixels: &[(usize, usize)]) -> Vec<bool> {
         let cloud = half_a_wall();
-        let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
+        let views = [SubmapView::new(&cloud, Pose::identity())];
         let noise = DepthNoise { base_m: 0.001, quadratic_per_m: 0.0 };
         let test = GrowthTest { observed_depth_m, noise, sigma_factor: 3.0, relative: 0.01 };
         let rendering = render(&views, &CAMERA, &RenderSettings::default(), Some(&test));

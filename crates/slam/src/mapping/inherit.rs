@@ -1,6 +1,7 @@
 //! What a new submap takes over from the one before: the surfels that its anchor sees. Their geometry has been averaged
 //! over many frames, where the anchor alone would give one frame's noise.
 
+use super::fuse::Measured;
 use crate::tracking::view::TrackingView;
 use coma_geometry::Pose;
 use coma_surfel::SurfelCloud;
@@ -29,19 +30,19 @@ impl Default for InheritSettings {
     }
 }
 
-/// Surfels in the new submap's frame, and the variances of their positions.
+/// Surfels in the new submap's frame, and what was measured of them.
 #[derive(Clone, Debug, Default)]
 pub struct Inheritance {
     /// In the new submap's frame.
     pub surfels: SurfelCloud,
-    /// Along their normals, one for each.
-    pub variance_m2: Vec<f32>,
+    /// One for each.
+    pub measured: Measured,
 }
 
 /// Takes over what the anchor `view` sees of `surfels`. `seed_px`: standard deviation of a new surfel, pixels.
 pub fn inherit(
     surfels: &SurfelCloud,
-    variance_m2: &[f32],
+    measured: &Measured,
     anchor_from_submap: &Pose,
     view: &TrackingView,
     seed_px: f32,
@@ -54,22 +55,22 @@ pub fn inherit(
     let level = &view.levels[0];
     let (width, height) = (level.depth_m.width() as f32, level.depth_m.height() as f32);
     let (beyond_x, beyond_y) = (settings.margin * width, settings.margin * height);
-    for (surfel, variance) in surfels.iter().zip(variance_m2) {
+    for (index, surfel) in surfels.iter().enumerate() {
         let surfel = surfel.moved(anchor_from_submap);
         let center = Vector3::from(surfel.center_m);
         let Some((u, v)) = level.place(&center) else { continue };
         if !(u >= -beyond_x && v >= -beyond_y && u < width + beyond_x && v < height + beyond_y) {
             continue;
         }
-        let measured = level.pixel((u, v)).map(|pixel| level.depth_m[pixel]).filter(|z| *z > 0.0);
-        if measured.is_some_and(|z| (z - center.z).abs() > settings.relative * z) {
+        let seen = level.pixel((u, v)).map(|pixel| level.depth_m[pixel]).filter(|z| *z > 0.0);
+        if seen.is_some_and(|z| (z - center.z).abs() > settings.relative * z) {
             continue;
         }
         // The smaller scale isn't stretched along an incline.
         let size = surfel.scale_m[0].min(surfel.scale_m[1]) * level.camera.fx as f32 / center.z / seed_px;
         if size >= settings.min_size && size <= settings.max_size {
             out.surfels.push(surfel);
-            out.variance_m2.push(*variance);
+            out.measured.push(measured.variance_m2[index], measured.intensity[index]);
         }
     }
     out
@@ -108,9 +109,11 @@ mod tests {
             };
             let cloud = [seen.moved(&anchor_from_submap.inverse())].into_iter().collect();
             let settings = InheritSettings::default();
-            let found = inherit(&cloud, &[1e-4], &anchor_from_submap, &view, 1.6, &settings);
-            assert_eq!(found.variance_m2.len(), comes as usize, "{center_m:?}, {size_px} px");
+            let measured = Measured { variance_m2: vec![1e-4], intensity: vec![0.3] };
+            let found = inherit(&cloud, &measured, &anchor_from_submap, &view, 1.6, &settings);
+            assert_eq!(found.surfels.len(), comes as usize, "{center_m:?}, {size_px} px");
             if comes {
+                assert_eq!(found.measured, measured);
                 let off = Vector3::from(found.surfels.center_m[0]) - Vector3::from(center_m);
                 assert!(off.norm() < 1e-6, "{off:?}");
             }

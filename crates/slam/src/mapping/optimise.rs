@@ -318,9 +318,9 @@ pub fn optimise_once(
     settings: &OptimiseSettings,
 ) -> (Loss, u64) {
     let camera_from_submap = target.submap_from_camera.inverse();
-    let views = [SubmapView { surfels, camera_from_submap }];
+    let views = [SubmapView::new(surfels, camera_from_submap)];
     let rendering =
-        coma_raster::render_only(&views, &target.camera, render_settings, None, Outputs::OPTIMISING);
+        coma_raster::render_only(&views, &target.camera, render_settings, None, Outputs::Optimising);
     let (loss, pixels) = loss(&rendering, target, settings);
     let gradients = coma_raster::backward(&views, &target.camera, render_settings, &rendering, &pixels);
     let hits = rendering.hits;

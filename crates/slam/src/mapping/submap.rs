@@ -1,6 +1,6 @@
 //! The submap under work: surfels in its own frame, its keyframes, and how they grow.
 
-use super::fuse::{FuseSettings, fuse};
+use super::fuse::{FuseSettings, Measured, fuse};
 use super::growth::{GrowthRule, new_pixels};
 use super::inherit::{InheritSettings, Inheritance, inherit};
 use super::optimise::{Adam, Loss, OptimiseSettings, Target, optimise_once};
@@ -38,6 +38,9 @@ pub struct MappingSettings {
     pub moved_m: f64,
     /// ... or turned so far, radians.
     pub moved_rad: f64,
+    /// A camera that stood still for so many frames has nothing to add until it moves again: a map that followed its
+    /// noise would wander, and the camera with it.
+    pub rest_after_frames: u32,
     /// Where the map grows: `adaptive` or `usual`.
     pub growth: GrowthRule,
     /// Eq. 5: a blended surfel within so many sigma(z) of the observed depth is the same surface ...
@@ -63,6 +66,7 @@ impl Default for MappingSettings {
             moved_new_share: 0.02,
             moved_m: 0.02,
             moved_rad: 1f64.to_radians(),
+            rest_after_frames: 10,
             growth: GrowthRule::Adaptive,
             growth_sigma: 3.0,
             growth_relative: 0.01,
@@ -84,12 +88,14 @@ pub struct ActiveSubmap {
     pub surfels: SurfelCloud,
     /// Grows whenever surfels change.
     pub revision: u64,
-    /// Of each surfel's position along its normal.
-    variance_m2: Vec<f32>,
+    /// Of the surfels, one for each.
+    pub measured: Measured,
     adam: Adam,
     keyframes: Vec<Target>,
     mapped_frames: u32,
     moving_frames: u32,
+    /// Frames since the last that moved.
+    still_frames: u32,
     last_counted: Pose,
     steps_taken: usize,
     /// Optimiser steps that are due until the next keyframe.
@@ -101,7 +107,7 @@ pub struct ActiveSubmap {
 pub struct MappedFrame {
     /// Surfels that were added.
     pub added: usize,
-    /// Share of the pixels with depth that the submap did not know, 0..1.
+    /// Share of the pixels with depth that the submap did not know and that can become surfels, 0..1.
     pub new_share: f32,
     /// Optimiser steps that were taken.
     pub steps: u32,
@@ -114,18 +120,19 @@ pub struct MappedFrame {
 impl ActiveSubmap {
     /// A submap with what it inherits; map its anchor next.
     pub fn open(id: SubmapId, chain: u32, agent_from_submap: Pose, inherited: Inheritance) -> Self {
-        let Inheritance { surfels, variance_m2 } = inherited;
+        let Inheritance { surfels, measured } = inherited;
         ActiveSubmap {
             id,
             chain,
             agent_from_submap,
             surfels,
-            variance_m2,
+            measured,
             revision: 0,
             adam: Adam::default(),
             keyframes: Vec::new(),
             mapped_frames: 0,
             moving_frames: 0,
+            still_frames: 0,
             last_counted: Pose::identity(),
             steps_taken: 0,
             owed_steps: 0,
@@ -153,13 +160,21 @@ impl ActiveSubmap {
         let mut out = MappedFrame::default();
         let color = corrected_color(&frame.color, brightness);
         let camera_from_submap = submap_from_camera.inverse();
-        if settings.fuse.enabled {
-            fuse(&mut self.surfels, &mut self.variance_m2, view, &camera_from_submap, &settings.fuse);
+        let at_rest = self.still_frames >= settings.rest_after_frames.max(1);
+        if settings.fuse.enabled && !at_rest {
+            fuse(
+                &mut self.surfels,
+                &mut self.measured,
+                view,
+                brightness,
+                &camera_from_submap,
+                &settings.fuse,
+            );
         }
         // At the resolution of the seeds: one look at each pixel that may become a surfel.
         let grid = SeedGrid::of(&frame.camera, &settings.seed);
         let depth_m = grid.pick(&frame.depth_m);
-        let views = [SubmapView { surfels: &self.surfels, camera_from_submap }];
+        let views = [SubmapView::new(&self.surfels, camera_from_submap)];
         let test = GrowthTest {
             observed_depth_m: &depth_m,
             noise: frame.noise,
@@ -168,36 +183,33 @@ impl ActiveSubmap {
         };
         let coarse = render_settings.resized(grid.camera.fx / frame.camera.fx);
         let rendering =
-            coma_raster::render_only(&views, &grid.camera, &coarse, Some(&test), Outputs::OPTIMISING);
+            coma_raster::render_only(&views, &grid.camera, &coarse, Some(&test), Outputs::Optimising);
         out.hits += rendering.hits;
         let wanted = new_pixels(settings.growth, &rendering, &depth_m, settings.covered_opacity);
         let new_surfels =
             seed(frame, submap_from_camera, &settings.seed, &grid, &wanted, |x, y| color[(x, y)]);
+        let measured = depth_m.pixels().iter().filter(|z| **z > 0.0).count();
+        out.new_share = new_surfels.len() as f32 / measured.max(1) as f32;
+        let moved = self.note_motion(submap_from_camera, out.new_share, settings);
+        if at_rest && !moved {
+            return out;
+        }
         out.added = new_surfels.len();
-        out.new_share = new_share(&depth_m, &wanted);
         for surfel in new_surfels {
             let depth_m = (camera_from_submap * Point3::from(surfel.center_m).cast::<f64>()).z as f32;
             let sigma = frame.noise.sigma_m(depth_m);
-            self.variance_m2.push(sigma * sigma);
+            let [r, g, b] = surfel.color;
+            self.measured.push(sigma * sigma, 0.299 * r + 0.587 * g + 0.114 * b);
             self.surfels.push(surfel);
         }
         self.adam.resize(self.surfels.len());
-
-        let (moved_m, moved_rad) = se3::distance(&self.last_counted, submap_from_camera);
-        let first = self.mapped_frames == 0;
-        if !first
-            && (out.new_share >= settings.moved_new_share
-                || moved_m >= settings.moved_m
-                || moved_rad >= settings.moved_rad)
-        {
-            self.moving_frames += 1;
-            self.last_counted = *submap_from_camera;
-        }
         let due = self.mapped_frames.is_multiple_of(settings.keyframe_every.max(1));
         self.mapped_frames += 1;
         if due || urgent {
             self.add_keyframe(frame, color, submap_from_camera);
-            self.owed_steps += settings.steps_per_keyframe;
+            // What a small budget left undone lapses.
+            self.owed_steps =
+                (self.owed_steps + settings.steps_per_keyframe).min(2 * settings.steps_per_keyframe);
         }
         // Spread over the frames until the next keyframe, so that no frame takes much longer than the others.
         let every = settings.keyframe_every.max(1);
@@ -209,6 +221,23 @@ impl ActiveSubmap {
             self.revision += 1;
         }
         out
+    }
+
+    /// Has the camera moved since the last frame that counted? The anchor counts as the first.
+    fn note_motion(&mut self, submap_from_camera: &Pose, new_share: f32, settings: &MappingSettings) -> bool {
+        let (moved_m, moved_rad) = se3::distance(&self.last_counted, submap_from_camera);
+        let moved = self.mapped_frames > 0
+            && (new_share >= settings.moved_new_share
+                || moved_m >= settings.moved_m
+                || moved_rad >= settings.moved_rad);
+        if moved {
+            self.moving_frames += 1;
+            self.still_frames = 0;
+            self.last_counted = *submap_from_camera;
+        } else {
+            self.still_frames += 1;
+        }
+        moved
     }
 
     fn add_keyframe(&mut self, frame: &RgbdFrame, color: Image<[f32; 3]>, submap_from_camera: &Pose) {
@@ -259,14 +288,16 @@ impl ActiveSubmap {
     ) -> Inheritance {
         let seed_px = settings.seed.spacing_px.max(1) as f32 * settings.seed.scale_in_spacings;
         let anchor_from_submap = submap_from_anchor.inverse();
-        inherit(&self.surfels, &self.variance_m2, &anchor_from_submap, view, seed_px, &settings.inherit)
+        inherit(&self.surfels, &self.measured, &anchor_from_submap, view, seed_px, &settings.inherit)
     }
 
-    /// The finished submap's surfels, pruned.
-    pub fn close(mut self, settings: &MappingSettings) -> SurfelCloud {
+    /// The finished submap's surfels, pruned, and their measured intensity.
+    pub fn close(mut self, settings: &MappingSettings) -> (SurfelCloud, Vec<f32>) {
         let keep: Vec<bool> = self.surfels.opacity.iter().map(|o| *o >= settings.prune_opacity).collect();
         self.surfels.retain(&keep);
-        self.surfels
+        let mut kept = keep.iter();
+        self.measured.intensity.retain(|_| kept.next().is_some_and(|keep| *keep));
+        (self.surfels, self.measured.intensity)
     }
 }
 
@@ -275,13 +306,4 @@ pub fn corrected_color(color: &Image<[u8; 3]>, brightness: Brightness) -> Image<
     let table: [f32; 256] =
         std::array::from_fn(|v| (brightness.gain as f32 * v as f32 / 255.0).clamp(0.0, 1.0));
     color.map(|c| c.map(|v| table[v as usize]))
-}
-
-fn new_share(depth_m: &Image<f32>, wanted: &Image<bool>) -> f32 {
-    let (mut seen, mut new) = (0u32, 0u32);
-    for (_, wanted) in depth_m.pixels().iter().zip(wanted.pixels()).filter(|(z, _)| **z > 0.0) {
-        seen += 1;
-        new += *wanted as u32;
-    }
-    new as f32 / seen.max(1) as f32
 }

@@ -153,16 +153,10 @@ pub fn refine(
     let mut best = Refined { agent_from_camera: pose, loss: f64::INFINITY, hits: 0 };
     for step in 0..=settings.steps {
         let camera_from_agent = pose.inverse();
-        let views: Vec<SubmapView<'_>> = model
-            .submaps
-            .iter()
-            .map(|(surfels, agent_from_submap)| SubmapView {
-                surfels,
-                camera_from_submap: camera_from_agent * agent_from_submap,
-            })
-            .collect();
+        let views: Vec<SubmapView<'_>> =
+            model.submaps.iter().map(|part| part.seen(&camera_from_agent)).collect();
         let rendering =
-            coma_raster::render_only(&views, &frame.camera, model.render, None, Outputs::OPTIMISING);
+            coma_raster::render_only(&views, &frame.camera, model.render, None, Outputs::Optimising);
         best.hits += rendering.hits;
         let loss = pose_loss(&rendering, observed, settings);
         if loss.value < best.loss {

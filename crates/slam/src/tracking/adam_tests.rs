@@ -29,10 +29,10 @@ fn refined(settings: &AdamSettings) -> (Pose, Pose, Refined) {
     let cloud = surfels(&frame, 2);
     let render = RenderSettings::default();
     let truth = se3::exp(&Tangent::new(0.02, -0.01, 0.015, 0.01, -0.02, 0.01));
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: truth.inverse() }];
-    let seen = coma_raster::render_only(&views, &frame.camera, &render, None, Outputs::OPTIMISING);
+    let views = [SubmapView::new(&cloud, truth.inverse())];
+    let seen = coma_raster::render_only(&views, &frame.camera, &render, None, Outputs::Optimising);
     let seen = RgbdFrame { color: seen.color.to_bytes(), depth_m: seen.depth_m, ..frame };
-    let model = Model { submaps: vec![(&cloud, Pose::identity())], render: &render };
+    let model = Model { submaps: vec![Part::new(&cloud, Pose::identity())], render: &render };
     let guess = truth * se3::exp(&Tangent::new(0.004, -0.003, 0.003, 0.003, -0.003, 0.003));
     (guess, truth, refine(&model, &seen, &guess, Brightness::default(), settings).unwrap())
 }
@@ -59,7 +59,7 @@ fn a_picture_without_depth_leaves_nothing_to_refine() {
     let cloud = surfels(&frame, 2);
     let blind = RgbdFrame { depth_m: Image::filled(48, 36, 0.0), ..frame };
     let render = RenderSettings::default();
-    let model = Model { submaps: vec![(&cloud, Pose::identity())], render: &render };
+    let model = Model { submaps: vec![Part::new(&cloud, Pose::identity())], render: &render };
     let found = refine(&model, &blind, &Pose::identity(), Brightness::default(), &AdamSettings::default());
     assert!(found.is_none());
 }
@@ -94,8 +94,8 @@ fn the_derivative_by_the_pose_agrees_with_differences_of_the_definition() {
     // Little is cut off, so that differences meet no cliff; depth weighs enough to be seen.
     let render = RenderSettings { alpha_min: 1e-7, transmittance_min: 0.0, ..Default::default() };
     let settings = AdamSettings { depth_weight: 0.3, min_opacity: 0.6, ..Default::default() };
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
-    let rendering = coma_raster::render_only(&views, &first.camera, &render, None, Outputs::OPTIMISING);
+    let views = [SubmapView::newPart::new(&cloud, Pose::identity())];
+    let rendering = coma_raster::render_only(&views, &first.camera, &render, None, Outputs::Optimising);
     let loss = pose_loss(&rendering, observed, &settings);
     assert!(loss.mask.pixels().iter().filter(|counts| **counts).count() > 500);
     let found = coma_raster::backward(&views, &first.camera, &render, &rendering, &loss.by_pixel).pose;
@@ -130,8 +130,8 @@ fn pixels_far_off_or_not_covered_do_not_count() {
     let cloud = surfels(&frame, 1);
     let color = frame.color.to_unit();
     let render = RenderSettings::default();
-    let views = [SubmapView { surfels: &cloud, camera_from_submap: Pose::identity() }];
-    let rendering = coma_raster::render_only(&views, &frame.camera, &render, None, Outputs::OPTIMISING);
+    let views = [SubmapView::newPart::new(&cloud, Pose::identity())];
+    let rendering = coma_raster::render_only(&views, &frame.camera, &render, None, Outputs::Optimising);
     let settings = AdamSettings::default();
     let mut depth_m = frame.depth_m.clone();
     let observed = Observed { color: &color, depth_m: &depth_m };

@@ -30,8 +30,9 @@ pub struct AlignSettings {
     pub min_photometric_scale: f32,
     /// Smallest geometric scale, in units of sigma(z).
     pub min_geometric_scale: f32,
-    /// Huber's constant, in units of the residuals' scale.
-    pub huber: f32,
+    /// Residuals in units of their scale follow a t-distribution with so many degrees of freedom: the fewer, the less
+    /// those count that don't fit.
+    pub freedom: f32,
     /// How far the motion may be from the initial guess, metres (one standard deviation): holds directions
     /// that the pictures say nothing of.
     pub prior_m: f64,
@@ -46,10 +47,10 @@ impl Default for AlignSettings {
             finest_stride: 1,
             max_distance_sigma: 8.0,
             max_distance_m: 0.06,
-            photometric_weight: 0.8,
+            photometric_weight: 1.2,
             min_photometric_scale: 0.008,
             min_geometric_scale: 0.1,
-            huber: 1.345,
+            freedom: 5.0,
             prior_m: 0.05,
             prior_rad: 0.05,
         }
@@ -81,10 +82,14 @@ pub struct Alignment {
     pub hessian: Matrix6,
     /// Pixels with depth that were looked at.
     pub pixels: usize,
+    /// Those that should be seen in the reference: it has a surface in their direction.
+    pub overlap: usize,
     /// Those that found a partner.
     pub matched: usize,
     /// Those whose point-to-plane residual is within 3 scales or 1 % of the depth.
     pub inliers: usize,
+    /// Those of them that look like their partner.
+    pub alike: usize,
     /// Robust scale of the geometric residuals, in units of sigma(z).
     pub geometric_scale: f64,
     /// Robust scale of the photometric residuals.
@@ -97,6 +102,11 @@ impl Alignment {
     /// Share of the pixels with depth that fit.
     pub fn inlier_share(&self) -> f64 {
         self.inliers as f64 / self.pixels.max(1) as f64
+    }
+
+    /// Share of what both see that fits and looks alike. Low where a motion is a false one, however much of the picture is new.
+    pub fn agreement(&self) -> f64 {
+        self.alike as f64 / self.overlap.max(1) as f64
     }
 
     /// Covariance of the motion, perturbed on the right: the inverse Hessian with one effective sample per
@@ -168,8 +178,10 @@ pub fn align(
         brightness,
         hessian: to_right.transpose() * system.hessian * to_right,
         pixels: system.pixels,
+        overlap: system.overlap,
         matched: system.matched,
         inliers: system.inliers,
+        alike: system.alike,
         geometric_scale: scales.geometric,
         photometric_scale: scales.photometric,
         median_distance_m: system.median_distance_m(),
@@ -233,8 +245,10 @@ struct System {
     /// Sum over their partners.
     reference_brightness: f64,
     pixels: usize,
+    overlap: usize,
     matched: usize,
     inliers: usize,
+    alike: usize,
     geometric: Histogram,
     photometric: Histogram,
     distance: Histogram,
@@ -245,6 +259,9 @@ pub const CORRELATED_PIXELS: f64 = 64.0;
 
 /// A point within this share of its depth fits, however sure the sensor is of it.
 const FITS_RELATIVE: f32 = 0.01;
+
+/// A point looks like its partner if their intensities, 0..1, differ by less.
+const FITS_INTENSITY: f32 = 0.15;
 
 /// Rows that one task sums up: fixed, so that sums do not depend on the number of threads.
 const ROWS_PER_TASK: usize = 16;
@@ -314,6 +331,7 @@ impl Problem<'_> {
             if !(z_ref > 0.0) || n == [0.0; 3] {
                 continue;
             }
+            out.overlap += 1;
             let n = Vector3::from(n);
             let q = Vector3::new(
                 (nearest.0 as f32 - rcx) * inv_rfx * z_ref,
@@ -369,7 +387,7 @@ impl System {
             inv_geometric: 1.0 / scales.geometric as f32,
             inv_photometric: 1.0 / scales.photometric as f32,
             photometric: settings.photometric_weight * settings.photometric_weight,
-            huber: settings.huber,
+            freedom: settings.freedom,
         };
         for i in 0..matches.len() {
             let distance = matches.distance[i].abs();
@@ -377,7 +395,9 @@ impl System {
             self.distance.add(distance / matches.inv_sigma[i]);
             self.photometric.add(matches.difference[i].abs());
             let close = distance < FITS_RELATIVE * matches.point[2][i].abs() * matches.inv_sigma[i];
-            self.inliers += (close || distance * weights.inv_geometric < 3.0) as usize;
+            let fits = close || distance * weights.inv_geometric < 3.0;
+            self.inliers += fits as usize;
+            self.alike += (fits && matches.difference[i].abs() < FITS_INTENSITY) as usize;
         }
         let sums = rows::sum(matches, &weights);
         let mut k = 0;
@@ -401,8 +421,10 @@ impl System {
             own_brightness: 0.0,
             reference_brightness: 0.0,
             pixels: 0,
+            overlap: 0,
             matched: 0,
             inliers: 0,
+            alike: 0,
             geometric: empty,
             photometric: empty,
             distance: empty,
@@ -415,8 +437,10 @@ impl System {
         self.own_brightness += other.own_brightness;
         self.reference_brightness += other.reference_brightness;
         self.pixels += other.pixels;
+        self.overlap += other.overlap;
         self.matched += other.matched;
         self.inliers += other.inliers;
+        self.alike += other.alike;
         for (mine, theirs) in [
             (&mut self.geometric, &other.geometric),
             (&mut self.photometric, &other.photometric),

@@ -123,7 +123,7 @@ fn the_gradient_agrees_with_differences_of_the_frozen_association() {
         TrackingView::build(CAMERA, depth, intensity, DepthNoise { base_m: 0.01, quadratic_per_m: 0.0 }, 1)
     };
     let (reference, view) = (plane(), plane());
-    let settings = AlignSettings { huber: 1e9, ..Default::default() };
+    let settings = AlignSettings { freedom: 1e9, ..Default::default() };
     let problem = Problem {
         reference: &reference.levels[0],
         view: &view.levels[0],

@@ -47,8 +47,13 @@ pub struct TrackingSettings {
     pub map_at_once_share: f64,
     /// Below this share tracking is degraded.
     pub degraded_share: f64,
+    /// With a larger standard deviation in some direction, metres, tracking is degraded: what is seen leaves it open.
+    pub degraded_sigma_m: f64,
     /// Below this share the camera is lost.
     pub lost_share: f64,
+    /// Of what the map and the frame both show, at least this share fits, or the pose is a false one and the camera is
+    /// lost. Right poses reach 0.9 and more on real sensors.
+    pub lost_agreement: f64,
     /// A lost camera is found again in its last submap if at least this share of its pixels fit.
     pub relocate_share: f64,
     /// A frame with less depth than this share of its pixels can't be tracked.
@@ -70,6 +75,13 @@ impl TrackingSettings {
     }
 }
 
+impl Tracked {
+    /// Standard deviation of the position in its weakest direction, metres.
+    pub fn sigma_m(&self) -> f64 {
+        self.covariance.fixed_view::<3, 3>(0, 0).into_owned().symmetric_eigenvalues().max().max(0.0).sqrt()
+    }
+}
+
 impl Default for TrackingSettings {
     fn default() -> Self {
         TrackingSettings {
@@ -88,7 +100,9 @@ impl Default for TrackingSettings {
             model_opacity: 0.9,
             map_at_once_share: 0.4,
             degraded_share: 0.25,
+            degraded_sigma_m: 0.05,
             lost_share: 0.1,
+            lost_agreement: 0.5,
             relocate_share: 0.5,
             min_depth_share: 0.05,
             max_step_m: 0.5,
@@ -135,6 +149,22 @@ pub enum Reason {
         /// Percent.
         needed: f64,
     },
+    /// The frame shows other things than the map where it should show the same.
+    #[error("only {share:.1} % of what should be seen again fits the map, {needed:.1} % are needed")]
+    Contradicts {
+        /// Percent.
+        share: f64,
+        /// Percent.
+        needed: f64,
+    },
+    /// What is seen leaves a direction open.
+    #[error("what is seen fixes the position to {metres:.3} m only, {needed:.3} m are needed")]
+    Uncertain {
+        /// Metres, one standard deviation in the weakest direction.
+        metres: f64,
+        /// Metres.
+        needed: f64,
+    },
     /// The camera would have moved too far at once.
     #[error("the camera would have moved {metres:.2} m and {degrees:.1} degrees in one frame")]
     Jump {
@@ -156,6 +186,8 @@ pub struct Tracked {
     pub covariance: Matrix6,
     /// Share of the pixels with depth that fit the model.
     pub share: f64,
+    /// Of what the frame and the model both show, the share that fits.
+    pub agreement: f64,
     /// Little of the frame is in the map yet.
     pub map_at_once: bool,
     /// Blended hits of the model's renderings.
@@ -245,11 +277,17 @@ pub(crate) fn judged(
     if !(share >= settings.lost_share) {
         return Err(vec![Reason::FewFit { share: share * 100.0, needed: settings.lost_share * 100.0 }]);
     }
+    let agreement = found.agreement();
+    if !(agreement >= settings.lost_agreement) {
+        let needed = settings.lost_agreement * 100.0;
+        return Err(vec![Reason::Contradicts { share: agreement * 100.0, needed }]);
+    }
     Ok(Tracked {
         agent_from_camera: *pose,
         brightness: found.brightness,
         covariance: found.covariance(settings.floor_m, settings.floor_rad),
         share,
+        agreement,
         map_at_once: share < settings.map_at_once_share,
         hits,
     })

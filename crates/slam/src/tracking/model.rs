@@ -7,10 +7,37 @@ use coma_geometry::{Intrinsics, Pose};
 use coma_raster::{Outputs, RenderSettings, Rendering, SubmapView};
 use coma_surfel::SurfelCloud;
 
+/// One submap of a model.
+#[derive(Clone, Copy, Debug)]
+pub struct Part<'a> {
+    /// In the submap's frame.
+    pub surfels: &'a SurfelCloud,
+    /// As it was measured, one for each; without it that of their colour.
+    pub intensity: Option<&'a [f32]>,
+    /// Where the submap lies.
+    pub agent_from_submap: Pose,
+}
+
+impl<'a> Part<'a> {
+    /// With the intensity of the surfels' colours.
+    pub fn new(surfels: &'a SurfelCloud, agent_from_submap: Pose) -> Self {
+        Part { surfels, intensity: None, agent_from_submap }
+    }
+
+    /// As a camera sees it.
+    pub fn seen(&self, camera_from_agent: &Pose) -> SubmapView<'a> {
+        SubmapView {
+            surfels: self.surfels,
+            camera_from_submap: camera_from_agent * self.agent_from_submap,
+            intensity: self.intensity,
+        }
+    }
+}
+
 /// The submaps that are tracked against, in the agent's frame.
 pub struct Model<'a> {
-    /// Surfels, and where their submap lies.
-    pub submaps: Vec<(&'a SurfelCloud, Pose)>,
+    /// In any order.
+    pub submaps: Vec<Part<'a>>,
     /// How they are rendered.
     pub render: &'a RenderSettings,
 }
@@ -34,19 +61,12 @@ impl Model<'_> {
         settings: &TrackingSettings,
     ) -> ModelPicture {
         let camera_from_agent = agent_from_camera.inverse();
-        let views: Vec<SubmapView> = self
-            .submaps
-            .iter()
-            .map(|(surfels, agent_from_submap)| SubmapView {
-                surfels,
-                camera_from_submap: camera_from_agent * agent_from_submap,
-            })
-            .collect();
+        let views: Vec<SubmapView> = self.submaps.iter().map(|part| part.seen(&camera_from_agent)).collect();
         let camera = &like.levels[0].camera;
         let render = self.render.resized(camera.fx / full.fx);
-        let rendering = coma_raster::render_only(&views, camera, &render, None, Outputs::TRACKING);
+        let rendering = coma_raster::render_only(&views, camera, &render, None, Outputs::Tracking);
         let depth_m = trusted_depth(&rendering, settings);
-        let intensity = rendering.color.map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]);
+        let intensity = rendering.surface_intensity;
         let view = TrackingView::build(*camera, depth_m, intensity, like.noise, like.levels.len());
         ModelPicture { view, hits: rendering.hits }
     }

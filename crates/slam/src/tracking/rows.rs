@@ -58,8 +58,8 @@ pub struct Weights {
     pub inv_photometric: f32,
     /// Weight of a photometric residual against a geometric one.
     pub photometric: f32,
-    /// Huber's constant, in units of the scales.
-    pub huber: f32,
+    /// Degrees of freedom of the t-distribution that residuals in units of the scales follow.
+    pub freedom: f32,
 }
 
 /// Sums over a row: `J^T W J` (upper triangle, row by row) and `J^T W r`, both kinds of residuals together.
@@ -79,6 +79,7 @@ pub fn sum(matches: &mut Matches, weights: &Weights) -> RowSums {
 
 #[multiversion(targets("x86_64+avx512f+avx512dq+avx512vl+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn sum_lanes(m: &Matches, count: usize, weights: &Weights) -> RowSums {
+    let inv_freedom = 1.0 / weights.freedom;
     let mut hessian = [[0.0f32; LANES]; TRIANGLE];
     let mut gradient = [[0.0f32; LANES]; 6];
     for begin in (0..m.len()).step_by(LANES) {
@@ -102,8 +103,8 @@ fn sum_lanes(m: &Matches, count: usize, weights: &Weights) -> RowSums {
             j[4][i] = (pz[i] * nx[i] - px[i] * nz[i]) * s;
             j[5][i] = (px[i] * ny[i] - py[i] * nx[i]) * s;
             let scaled = distance[i].abs() * weights.inv_geometric;
-            let huber = if scaled <= weights.huber { 1.0 } else { weights.huber / scaled };
-            weight[i] = live[i] * huber * weights.inv_geometric * weights.inv_geometric;
+            let robust = 1.0 / (1.0 + scaled * scaled * inv_freedom);
+            weight[i] = live[i] * robust * weights.inv_geometric * weights.inv_geometric;
         }
         add(&j, &distance, &weight, &mut hessian, &mut gradient);
         // Photometric.
@@ -116,9 +117,9 @@ fn sum_lanes(m: &Matches, count: usize, weights: &Weights) -> RowSums {
             j[4][i] = pz[i] * dx[i] - px[i] * dz[i];
             j[5][i] = px[i] * dy[i] - py[i] * dx[i];
             let scaled = difference[i].abs() * weights.inv_photometric;
-            let huber = if scaled <= weights.huber { 1.0 } else { weights.huber / scaled };
+            let robust = 1.0 / (1.0 + scaled * scaled * inv_freedom);
             let unit = weights.inv_photometric * weights.inv_photometric * weights.photometric;
-            weight[i] = live[i] * huber * unit;
+            weight[i] = live[i] * robust * unit;
         }
         add(&j, &difference, &weight, &mut hessian, &mut gradient);
     }
@@ -159,7 +160,7 @@ mod tests {
     #[test]
     fn sums_agree_with_one_pixel_at_a_time_whatever_the_number_of_pixels() {
         let value = |k: usize, i: usize| ((k * 37 + i * 11) % 23) as f32 * 0.1 - 1.0;
-        let weights = Weights { inv_geometric: 1.5, inv_photometric: 4.0, photometric: 0.25, huber: 1.345 };
+        let weights = Weights { inv_geometric: 1.5, inv_photometric: 4.0, photometric: 0.25, freedom: 5.0 };
         for count in [1, 15, 16, 17, 50] {
             let mut m = Matches::default();
             for i in 0..count {
@@ -182,7 +183,7 @@ mod tests {
                         .chain(torque.iter().map(|t| t * scale))
                         .collect();
                     let scaled = r.abs() * inv;
-                    let weight = if scaled <= 1.345 { 1.0 } else { 1.345 / scaled } * inv * inv * unit;
+                    let weight = 5.0 / (5.0 + scaled * scaled) * inv * inv * unit;
                     let mut k = 0;
                     for a in 0..6 {
                         gradient[a] += weight * j[a] * r;

@@ -40,6 +40,18 @@ impl Level {
         (point.z > NEAR_M).then_some((u, v))
     }
 
+    /// Intensity at a place inside the picture, between the pixels around it.
+    pub fn intensity_at(&self, (u, v): (f32, f32)) -> f32 {
+        let (last_x, last_y) = (self.intensity.width() - 1, self.intensity.height() - 1);
+        let (u, v) = ((u - 0.5).max(0.0), (v - 0.5).max(0.0));
+        let (x, y) = ((u as usize).min(last_x), (v as usize).min(last_y));
+        let (right, below) = ((x + 1).min(last_x), (y + 1).min(last_y));
+        let (fu, fv) = (u - x as f32, v - y as f32);
+        let i = |x, y| self.intensity[(x, y)];
+        let row = |y| i(x, y) * (1.0 - fu) + i(right, y) * fu;
+        row(y) * (1.0 - fv) + row(below) * fv
+    }
+
     /// The pixel at such a place, if it lies inside.
     pub fn pixel(&self, (u, v): (f32, f32)) -> Option<(usize, usize)> {
         let (width, height) = (self.depth_m.width() as f32, self.depth_m.height() as f32);

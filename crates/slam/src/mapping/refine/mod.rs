@@ -17,7 +17,7 @@ use super::optimise::{Target, loss};
 use super::seed::{SeedGrid, seed};
 use crate::tracking::TrackingSettings;
 use crate::tracking::align::Brightness;
-use crate::tracking::model::Model;
+use crate::tracking::model::{Model, Part};
 use crate::tracking::view::TrackingView;
 use adam::Adam;
 use coma_frame::{Image, RgbdFrame};
@@ -179,17 +179,20 @@ impl Refiner {
 
     fn views(&self, view: usize) -> [SubmapView<'_>; 2] {
         let camera_from_submap = self.poses[view].inverse();
-        [&self.surfels, &self.fixed].map(|surfels| SubmapView { surfels, camera_from_submap })
+        [&self.surfels, &self.fixed].map(|surfels| SubmapView::new(surfels, camera_from_submap))
     }
 
     fn rendering(&self, view: usize, frame: &RgbdFrame) -> Rendering {
-        coma_raster::render_only(&self.views(view), &frame.camera, &self.render, None, Outputs::OPTIMISING)
+        coma_raster::render_only(&self.views(view), &frame.camera, &self.render, None, Outputs::Optimising)
     }
 
     /// Aligns a view with the map; where that fails, the pose stays.
     fn align(&mut self, view: usize, frame: &RgbdFrame) {
         let model = Model {
-            submaps: vec![(&self.surfels, Pose::identity()), (&self.fixed, Pose::identity())],
+            submaps: vec![
+                Part::new(&self.surfels, Pose::identity()),
+                Part::new(&self.fixed, Pose::identity()),
+            ],
             render: &self.render,
         };
         let levels = self.tracking.levels();
