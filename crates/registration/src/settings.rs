@@ -146,13 +146,13 @@ impl Default for Settings {
             min_eigenvalue_ratio: 0.004,
             weak_ratio: 0.05,
             focal_uncertainty: 0.03,
-            max_calibration_m: 0.035,
+            max_calibration_m: 0.04,
             depth_tolerance_m: 0.02,
             depth_tolerance_sigmas: 3.0,
             min_overlap: 0.2,
             max_conflict: 0.08,
             min_correlation: 0.6,
-            min_detail_correlation: 0.3,
+            min_detail_correlation: 0.27,
             min_contrast: 0.03,
         }
     }
