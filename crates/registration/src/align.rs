@@ -3,7 +3,7 @@
 use crate::consensus;
 use crate::gicp;
 use crate::icp::{self, Searchable};
-use crate::information::{Observability, information};
+use crate::information::{Observability, focal_sensitivity, information};
 use crate::matching::mutual_matches;
 use crate::outcome::{Alignment, Outcome, Reason, Side};
 use crate::settings::{Refiner, Scale, Settings};
@@ -37,6 +37,8 @@ pub struct Refined {
     pub correspondences: usize,
     /// Independent samples that they are worth.
     pub effective_samples: usize,
+    /// How far the translation moves if the focal lengths are wrong by `focal_uncertainty`, metres.
+    pub calibration_m: f64,
 }
 
 /// Registers two views from no initial guess. The same input and seed give the same bits.
@@ -127,6 +129,10 @@ fn judged(
 ) -> Result<(f64, Alignment), Reason> {
     let refined = refine(source, target, &hypothesis.target_from_source, settings)?;
     let evidence = verify::verify(source, target, &refined.target_from_source, settings)?;
+    if !(refined.calibration_m <= settings.max_calibration_m) {
+        let (metres, allowed) = (refined.calibration_m, settings.max_calibration_m);
+        return Err(Reason::PoorlyConstrained { metres, allowed });
+    }
     if !(evidence.consistency >= settings.min_fitness) {
         return Err(Reason::LowFitness { fitness: evidence.consistency, needed: settings.min_fitness });
     }
@@ -137,10 +143,12 @@ fn judged(
         conflicts: evidence.conflicts,
         rmse_m: refined.rmse_m,
         photometric_correlation: evidence.correlation,
+        detail_correlation: evidence.detail_correlation,
         eigenvalue_ratio: refined.eigenvalue_ratio,
         correspondences: refined.correspondences,
         inliers: hypothesis.inliers,
         effective_samples: refined.effective_samples,
+        calibration_m: refined.calibration_m,
     };
     Ok((evidence.score, alignment))
 }
@@ -208,6 +216,9 @@ pub fn refine(
     if residuals.len() < needed {
         return Err(diverged(residuals.len()));
     }
+    let by_focal = focal_sensitivity(&residuals, settings)
+        .ok_or(Reason::Unobservable { eigenvalue_ratio, needed: floor })?;
+    let calibration_m = settings.focal_uncertainty * by_focal.fixed_rows::<3>(0).norm();
     let (information, effective_samples) = information(&residuals, &observability, &source.camera, settings)
         .ok_or(Reason::Unobservable { eigenvalue_ratio, needed: floor })?;
     let scales = icp::Scales::of(&residuals);
@@ -222,6 +233,7 @@ pub fn refine(
         rmse_m: (sum / weight).sqrt(),
         correspondences: residuals.len(),
         effective_samples,
+        calibration_m,
     })
 }
 

@@ -26,12 +26,15 @@ pub struct Residual {
     pub photometric_row: Tangent,
     /// Standard deviation that the sensors promise for `geometric_m`, metres.
     pub sigma_m: f64,
+    /// Change of `geometric_m` and of `photometric` if both focal lengths were longer, per unit of their logarithm.
+    pub by_focal: (f64, f64),
 }
 
 impl Residual {
     /// Leaves the geometric part alone.
     pub(crate) fn forget_brightness(&mut self) {
         self.photometric = 0.0;
+        self.by_focal.1 = 0.0;
         self.photometric_row = Tangent::zeros();
     }
 }
@@ -119,6 +122,7 @@ pub fn linearise(
             photometric: (p.other + p.gradient.dot(&p.offset)) - (gain * p.own + offset),
             photometric_row: row(&p.gradient),
             sigma_m: p.sigma_m,
+            by_focal: (p.normal.dot(&p.by_focal), p.gradient.dot(&p.by_focal)),
         });
     }
     for p in &backward {
@@ -132,6 +136,7 @@ pub fn linearise(
             photometric: gain * (p.other + p.gradient.dot(&p.offset)) + offset - p.own,
             photometric_row: row(&(p.gradient * gain)),
             sigma_m: p.sigma_m,
+            by_focal: (p.normal.dot(&p.by_focal), gain * p.gradient.dot(&p.by_focal)),
         });
     }
     out
@@ -142,6 +147,8 @@ struct Met {
     point: Point3<f64>,
     moved: Point3<f64>,
     offset: Vector3<f64>,
+    /// Change of `offset` by the logarithm of both focal lengths.
+    by_focal: Vector3<f64>,
     normal: Vector3<f64>,
     gradient: Vector3<f64>,
     own: f64,
@@ -161,10 +168,14 @@ fn half(from: &Searchable, into: &Searchable, into_from_from: &Pose, max_distanc
             let normal = into.cloud.normals[j];
             let sigma_into = into.noise.sigma_m(into.cloud.points[j].z);
             let moved = into_from_from * point.cast::<f64>();
+            let there = into.cloud.points[j].cast::<f64>();
+            // A point lies at depth times pixel over focal length: a longer one draws it towards the axis.
+            let inwards = |p: &Point3<f64>| -Vector3::new(p.x, p.y, 0.0);
             Some(Met {
                 point: point.cast(),
                 moved,
-                offset: moved - into.cloud.points[j].cast::<f64>(),
+                offset: moved - there,
+                by_focal: into_from_from.rotation * inwards(&point.cast()) - inwards(&there),
                 normal: normal.cast(),
                 gradient: into.cloud.gradients[j].cast(),
                 own: from.cloud.intensity[i] as f64,

@@ -68,6 +68,23 @@ impl Observability {
     }
 }
 
+/// How far the motion would move if both focal lengths were longer, per unit of their logarithm: the Gauss-Newton
+/// step that the change of the residuals asks for. `None` if they do not pin the motion.
+pub fn focal_sensitivity(residuals: &[Residual], settings: &Settings) -> Option<Tangent> {
+    let scales = Scales::of(residuals);
+    let (mut h, mut g) = (Matrix6::zeros(), Tangent::zeros());
+    for r in residuals {
+        let (wg, wp) = scales.weights(r);
+        let wg = wg * settings.geometric_share * depth_weight(r.sigma_m);
+        let wp = wp * (1.0 - settings.geometric_share);
+        h.syger(wg, &r.geometric_row, &r.geometric_row, 1.0);
+        h.syger(wp, &r.photometric_row, &r.photometric_row, 1.0);
+        g += r.geometric_row * (wg * r.by_focal.0) + r.photometric_row * (wp * r.by_focal.1);
+    }
+    h.fill_upper_triangle_with_lower_triangle();
+    Some(-h.cholesky()?.solve(&g))
+}
+
 /// Information of `target_from_source` (right perturbation) from the residuals of the finest scale, and the
 /// number of independent samples it stands for. `None` if the result is not positive definite.
 pub fn information(
@@ -175,6 +192,7 @@ mod tests {
                     photometric: 0.0,
                     photometric_row: coma_geometry::Tangent::zeros(),
                     sigma_m: 0.01,
+                    by_focal: (0.0, 0.0),
                 });
             }
         }

@@ -9,8 +9,9 @@
 //! 5. [`consensus`]: RANSAC over matches that keep distances and angles, several hypotheses.
 //! 6. [`icp`]: multi-scale coloured ICP (Park, Zhou, Koltun 2017), both directions in one system; or [`gicp`],
 //!    generalised ICP (Segal, Haehnel, Thrun 2009), where brightness says nothing.
-//! 7. [`information`]: an information matrix that can be believed, and whether the scene pins all six degrees of freedom.
-//! 8. [`verify`]: overlap, free-space conflicts and photometric agreement at the found pose.
+//! 7. [`information`]: an information matrix that can be believed, and whether the scene pins all six degrees of freedom,
+//!    and pins them though the focal lengths are a little wrong.
+//! 8. [`verify`]: overlap, free-space conflicts and photometric agreement, broad and in [`detail`], at the found pose.
 //!
 //! [`align`] runs them all and ends as [`Outcome::Accepted`] or [`Outcome::Rejected`] with its reason.
 //! [`coarse`], [`decide`], [`refine`] and [`verify::verify`] are the parts.
@@ -22,6 +23,7 @@
 pub mod align;
 pub mod cloud;
 pub mod consensus;
+pub mod detail;
 pub mod fpfh;
 pub mod gicp;
 pub mod icp;

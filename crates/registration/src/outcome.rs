@@ -38,6 +38,8 @@ pub struct Alignment {
     pub rmse_m: f64,
     /// Zero-mean normalised correlation of the intensities of agreeing points; `None` if one view is too plain to say.
     pub photometric_correlation: Option<f64>,
+    /// The same of edges and texture, the lesser direction; `None` without any.
+    pub detail_correlation: Option<f64>,
     /// Smallest over largest eigenvalue of the Hessian.
     pub eigenvalue_ratio: f64,
     /// Correspondences of the last ICP step.
@@ -46,6 +48,8 @@ pub struct Alignment {
     pub inliers: usize,
     /// Independent residuals that the information stands for.
     pub effective_samples: usize,
+    /// How far the translation moves if the focal lengths are wrong by `focal_uncertainty` of the settings, metres.
+    pub calibration_m: f64,
 }
 
 /// Why two views were not registered.
@@ -117,6 +121,21 @@ pub enum Reason {
         /// Least correlation.
         needed: f64,
     },
+    /// Broad brightness agrees, edges and texture do not: the motion is off by some pixels, or depth and colour of a
+    /// frame are of two moments.
+    DetailMismatch {
+        /// Correlation found, the lesser direction.
+        correlation: f64,
+        /// Least correlation.
+        needed: f64,
+    },
+    /// The motion hangs on calibration: a focal length that is a little wrong moves it too far.
+    PoorlyConstrained {
+        /// How far focal lengths wrong by `focal_uncertainty` of the settings move it, metres.
+        metres: f64,
+        /// Most that is allowed, metres.
+        allowed: f64,
+    },
     /// Coloured ICP lost its correspondences or its system became singular.
     Diverged {
         /// Correspondences left.
@@ -167,6 +186,14 @@ impl fmt::Display for Reason {
             Reason::PhotometricMismatch { correlation, needed } => write!(
                 f,
                 "the surfaces agree but their brightness correlates by {correlation:.2}, {needed:.2} is needed"
+            ),
+            Reason::DetailMismatch { correlation, needed } => write!(
+                f,
+                "edges and texture on the surfaces correlate by {correlation:.2}, {needed:.2} is needed"
+            ),
+            Reason::PoorlyConstrained { metres, allowed } => write!(
+                f,
+                "a focal length that is a little wrong moves the motion by {metres:.3} m, {allowed:.3} m are allowed"
             ),
             Reason::Diverged { correspondences, needed } => write!(
                 f,

@@ -89,6 +89,10 @@ pub struct Settings {
     pub min_eigenvalue_ratio: f64,
     /// Below this ratio the variance along an eigenvector is inflated by `weak_ratio / ratio`.
     pub weak_ratio: f64,
+    /// How wrong the focal lengths may be, as a share: a Kinect with the maker's numbers is off by some 3 %.
+    pub focal_uncertainty: f64,
+    /// Farthest that this may move the translation, metres.
+    pub max_calibration_m: f64,
     /// Two depths agree within this plus `depth_tolerance_sigmas` of both sensors' noise, metres.
     pub depth_tolerance_m: f32,
     /// See `depth_tolerance_m`.
@@ -99,6 +103,8 @@ pub struct Settings {
     pub max_conflict: f64,
     /// Least zero-mean normalised correlation of the intensities of agreeing points.
     pub min_correlation: f64,
+    /// The same for edges and texture alone, the lesser direction.
+    pub min_detail_correlation: f64,
     /// Intensities whose standard deviation is below this (of 0..1) in either view say nothing; the correlation is then not used.
     pub min_contrast: f64,
 }
@@ -139,11 +145,14 @@ impl Default for Settings {
             floor_rad: 0.005_f64.to_radians(),
             min_eigenvalue_ratio: 0.004,
             weak_ratio: 0.05,
+            focal_uncertainty: 0.03,
+            max_calibration_m: 0.04,
             depth_tolerance_m: 0.02,
             depth_tolerance_sigmas: 3.0,
             min_overlap: 0.2,
             max_conflict: 0.08,
             min_correlation: 0.6,
+            min_detail_correlation: 0.27,
             min_contrast: 0.03,
         }
     }

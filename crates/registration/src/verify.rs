@@ -16,11 +16,16 @@ pub struct Evidence {
     pub conflicts: f64,
     /// Correlation of intensities of agreeing points; `None` if they are too plain to say.
     pub correlation: Option<f64>,
+    /// The same of their detail ([`crate::detail`]), the lesser direction.
+    pub detail_correlation: Option<f64>,
     /// Share of agreeing points minus twice that of conflicting ones, of all points: ranks hypotheses.
     pub score: f64,
     /// Share of agreeing points among those that fall onto a measurement of the other view.
     pub consistency: f64,
 }
+
+/// Detail with a standard deviation below this is noise.
+const MIN_DETAIL: f64 = 0.2;
 
 /// What happened to one view's points in the other.
 #[derive(Clone, Copy, Debug, Default)]
@@ -72,9 +77,21 @@ pub fn evidence(
     settings: &Settings,
 ) -> Evidence {
     let mut moments = Moments::default();
-    let forward = look(source, target, target_from_source, settings, 1, |a, b| moments.add(a, b));
-    let backward = look(target, source, &target_from_source.inverse(), settings, 1, |a, b| moments.add(b, a));
-    summary(&forward, &backward, moments.correlation(settings.min_contrast))
+    let (mut there, mut back) = (Moments::default(), Moments::default());
+    let forward = look(source, target, target_from_source, settings, 1, |at, (u, v)| {
+        moments.add(source.intensity[at] as f64, bilinear(&target.intensity, u, v) as f64);
+        there.add(source.detail[at] as f64, bilinear(&target.detail, u, v) as f64);
+    });
+    let backward = look(target, source, &target_from_source.inverse(), settings, 1, |at, (u, v)| {
+        moments.add(bilinear(&source.intensity, u, v) as f64, target.intensity[at] as f64);
+        back.add(bilinear(&source.detail, u, v) as f64, target.detail[at] as f64);
+    });
+    let details = there.correlation(MIN_DETAIL).zip(back.correlation(MIN_DETAIL));
+    Evidence {
+        correlation: moments.correlation(settings.min_contrast),
+        detail_correlation: details.map(|(there, back)| there.min(back)),
+        ..summary(&forward, &backward)
+    }
 }
 
 /// [`Evidence::score`] of many poses, from every third point; in the order given.
@@ -84,12 +101,13 @@ pub fn scores(source: &Prepared, target: &Prepared, poses: &[Pose], settings: &S
         .map(|pose| {
             let forward = look(source, target, pose, settings, 3, |_, _| ());
             let backward = look(target, source, &pose.inverse(), settings, 3, |_, _| ());
-            summary(&forward, &backward, None).score
+            summary(&forward, &backward).score
         })
         .collect()
 }
 
-fn summary(forward: &Counts, backward: &Counts, correlation: Option<f64>) -> Evidence {
+/// What the counts say, without the pictures.
+fn summary(forward: &Counts, backward: &Counts) -> Evidence {
     let share = |part: usize, of: usize| if of == 0 { 0.0 } else { part as f64 / of as f64 };
     let agree = forward.agree + backward.agree;
     let conflict = forward.conflict + backward.conflict;
@@ -98,20 +116,22 @@ fn summary(forward: &Counts, backward: &Counts, correlation: Option<f64>) -> Evi
     Evidence {
         overlap: share(forward.agree, forward.points).min(share(backward.agree, backward.points)),
         conflicts: share(conflict, agree + conflict),
-        correlation,
+        correlation: None,
+        detail_correlation: None,
         score: share(agree, points) - 2.0 * share(conflict, points),
         consistency: share(agree, hit),
     }
 }
 
-/// Moves one view's grid points into the other and compares depths. `pair` gets the intensities of agreeing points.
+/// Moves one view's grid points into the other and compares depths. `pair` gets the pixel of each agreeing point and
+/// where the other view should show it.
 fn look(
     from: &Prepared,
     into: &Prepared,
     into_from_from: &Pose,
     settings: &Settings,
     step: usize,
-    mut pair: impl FnMut(f64, f64),
+    mut pair: impl FnMut((usize, usize), (f32, f32)),
 ) -> Counts {
     let mut counts = Counts::default();
     let (width, height) = (into.depth_m.width(), into.depth_m.height());
@@ -143,8 +163,7 @@ fn look(
         let tolerance = settings.depth_tolerance_m + settings.depth_tolerance_sigmas * sigma;
         if miss <= tolerance {
             counts.agree += 1;
-            let other = bilinear(&into.intensity, pixel.x as f32, pixel.y as f32);
-            pair(from.intensity[(x as usize, y as usize)] as f64, other as f64);
+            pair((x as usize, y as usize), (pixel.x as f32, pixel.y as f32));
         } else if expected < nearest - tolerance {
             counts.conflict += 1;
         } else {
@@ -172,6 +191,11 @@ pub fn verify(
         && !(correlation >= settings.min_correlation)
     {
         return Err(Reason::PhotometricMismatch { correlation, needed: settings.min_correlation });
+    }
+    if let Some(correlation) = evidence.detail_correlation
+        && !(correlation >= settings.min_detail_correlation)
+    {
+        return Err(Reason::DetailMismatch { correlation, needed: settings.min_detail_correlation });
     }
     Ok(evidence)
 }

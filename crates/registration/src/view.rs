@@ -46,6 +46,8 @@ pub struct Prepared {
     pub clouds: Vec<PointCloud>,
     /// One feature per point of `clouds[0]`.
     pub features: Vec<crate::fpfh::Feature>,
+    /// Detail of `intensity`.
+    pub(crate) detail: Image<f32>,
     /// Points of `depth_m` on a grid, for scoring and verification: pixel x, y and depth.
     pub(crate) grid: Vec<(u16, u16, f32)>,
 }
@@ -92,7 +94,8 @@ impl Prepared {
                 }
             }
         }
-        Ok(Prepared { depth_m, intensity, camera, noise: view.noise, clouds, features, grid })
+        let detail = crate::detail::detail(&intensity);
+        Ok(Prepared { depth_m, intensity, camera, noise: view.noise, clouds, features, detail, grid })
     }
 }
 

@@ -92,7 +92,7 @@ pub async fn index(node: Arc<Node>, mut client: Client) {
     loop {
         // Counted from before they are taken, so that a drain never sees neither.
         let unfinished = Unfinished::begin(&node);
-        let (inserts, queries) = {
+        let (inserts, mut queries) = {
             let mut knowledge = node.lock();
             (knowledge.closer.take_inserts(), knowledge.closer.take_queries())
         };
@@ -101,12 +101,17 @@ pub async fn index(node: Arc<Node>, mut client: Client) {
             node.places_wake.notified().await;
             continue;
         }
-        if let Err(e) = insert(&node, &mut client, &inserts).await {
-            debug!(error = %format!("{e:#}"), "place recognition did not take anchors yet");
-            node.lock().closer.retry(inserts, queries);
-            tokio::time::sleep(RETRY).await;
-            continue;
-        }
+        let without_room = match insert(&node, &mut client, &inserts).await {
+            Ok(without_room) => without_room,
+            Err(e) => {
+                debug!(error = %format!("{e:#}"), "place recognition did not take anchors yet");
+                node.lock().closer.retry(inserts, queries);
+                tokio::time::sleep(RETRY).await;
+                continue;
+            }
+        };
+        // What is not in the index can't be looked up there, and would read as an index that started anew.
+        queries.retain(|submap| !without_room.contains(submap));
         for (i, submap) in queries.iter().enumerate() {
             if let Err(e) = query(&node, &mut client, submap).await {
                 debug!(error = %format!("{e:#}"), "place recognition did not answer a query yet");
@@ -127,7 +132,8 @@ fn is_not_found(error: &anyhow::Error) -> bool {
     error.downcast_ref::<tonic::Status>().is_some_and(|status| status.code() == tonic::Code::NotFound)
 }
 
-async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyhow::Result<()> {
+/// Gives anchors to place recognition; those that it has no room for come back, set aside.
+async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyhow::Result<Vec<SubmapId>> {
     let (index, anchors) = {
         let knowledge = node.lock();
         let anchor = |id: &SubmapId| {
@@ -142,6 +148,7 @@ async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyho
         (knowledge.agent.to_string(), submaps.iter().filter_map(anchor).collect::<Vec<_>>())
     };
     let mut held = None;
+    let mut without_room = Vec::new();
     let mut rest: &[v1::Anchor] = &anchors;
     let mut together = ANCHORS_PER_CALL;
     while !rest.is_empty() {
@@ -155,7 +162,7 @@ async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyho
             // All or none of a call: one by one, as many as there is room for.
             Err(status) if coma_wire::is_full(&status) && chunk.len() > 1 => together = 1,
             Err(status) if coma_wire::is_full(&status) => {
-                set_aside(node, rest, status.message())?;
+                without_room = set_aside(node, rest, status.message())?;
                 break;
             }
             Err(status) => return Err(status.into()),
@@ -166,11 +173,11 @@ async fn insert(node: &Node, client: &mut Client, submaps: &[SubmapId]) -> anyho
         debug!(held, "place recognition started anew: it is given all anchors again");
         knowledge.closer.insert_all_again();
     }
-    Ok(())
+    Ok(without_room)
 }
 
 /// Place recognition has no room for these anchors: users are told, and the agent goes on without them.
-fn set_aside(node: &Node, anchors: &[v1::Anchor], message: &str) -> anyhow::Result<()> {
+fn set_aside(node: &Node, anchors: &[v1::Anchor], message: &str) -> anyhow::Result<Vec<SubmapId>> {
     let at = At::Root("anchors");
     let read = |a: &v1::Anchor| at.field("submap_id").required(a.submap_id.clone());
     let submaps = anchors.iter().map(read).collect::<Result<Vec<SubmapId>, _>>()?;
@@ -179,9 +186,9 @@ fn set_aside(node: &Node, anchors: &[v1::Anchor], message: &str) -> anyhow::Resu
         message, "place recognition has no room: these places can't be recognised"
     );
     let mut knowledge = node.lock();
-    knowledge.closer.set_aside(submaps);
+    knowledge.closer.set_aside(submaps.clone());
     knowledge.warn_once(format!("{message}: new places are no longer recognised"));
-    Ok(())
+    Ok(submaps)
 }
 
 async fn query(node: &Node, client: &mut Client, submap: &SubmapId) -> anyhow::Result<()> {
