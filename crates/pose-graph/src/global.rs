@@ -65,13 +65,13 @@ pub fn solve(entries: &GraphEntries, settings: &GlobalSettings) -> Solution {
 }
 
 /// The loops between two chains, by key, each with whether it starts in the first of them.
-type Between<'a> = Vec<(&'a Edge, bool)>;
-type Joins = BTreeMap<(usize, usize), Result<Joined, NotJoined>>;
+pub(crate) type Between<'a> = Vec<(&'a Edge, bool)>;
+pub(crate) type Joins = BTreeMap<(usize, usize), Result<Joined, NotJoined>>;
 
 /// The chain that holds each submap.
-type ChainOf<'a> = BTreeMap<&'a SubmapId, usize>;
+pub(crate) type ChainOf<'a> = BTreeMap<&'a SubmapId, usize>;
 
-fn chain_of(chains: &[Chain]) -> ChainOf<'_> {
+pub(crate) fn chain_of(chains: &[Chain]) -> ChainOf<'_> {
     let mut out = ChainOf::new();
     for (index, chain) in chains.iter().enumerate() {
         out.extend(chain.submaps.iter().map(|s| (s, index)));
@@ -80,12 +80,12 @@ fn chain_of(chains: &[Chain]) -> ChainOf<'_> {
 }
 
 /// The chain that holds both ends of a loop.
-fn chain_within(chain_of: &ChainOf, edge: &Edge) -> Option<usize> {
+pub(crate) fn chain_within(chain_of: &ChainOf, edge: &Edge) -> Option<usize> {
     let (from, to) = (chain_of.get(&edge.from)?, chain_of.get(&edge.to)?);
     (from == to).then_some(*from)
 }
 
-fn chain_pairs<'a>(loops: &'a [Edge], chain_of: &ChainOf) -> BTreeMap<(usize, usize), Between<'a>> {
+pub(crate) fn chain_pairs<'a>(loops: &'a [Edge], chain_of: &ChainOf) -> BTreeMap<(usize, usize), Between<'a>> {
     let mut pairs: BTreeMap<(usize, usize), Between> = BTreeMap::new();
     for edge in loops {
         if let (Some(&a), Some(&b)) = (chain_of.get(&edge.from), chain_of.get(&edge.to))
@@ -98,7 +98,7 @@ fn chain_pairs<'a>(loops: &'a [Edge], chain_of: &ChainOf) -> BTreeMap<(usize, us
 }
 
 /// Lays every chain out by its odometry, and those that may join another one by their own loops too.
-fn lay_out(
+pub(crate) fn lay_out(
     chains: &[Chain],
     loops: &[Edge],
     chain_of: &ChainOf,
@@ -136,7 +136,7 @@ fn lay_out(
     chains.iter().enumerate().map(lay_out_one).collect()
 }
 
-fn relate(
+pub(crate) fn relate(
     between: &Between,
     s: &Trunk,
     t: &Trunk,
@@ -336,7 +336,7 @@ fn solve_component(
 }
 
 /// Loops in the consistent set of a pair of chains that joined.
-fn supported(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
+pub(crate) fn supported(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
     let mut out = BTreeSet::new();
     for (pair, between) in pairs {
         if let Some(Ok(joined)) = joins.get(pair) {
@@ -348,7 +348,7 @@ fn supported(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeS
 }
 
 /// Loops that do not belong to the consistent set of a pair of chains that joined.
-fn contradicting(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
+pub(crate) fn contradicting(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
     let mut out = BTreeSet::new();
     for (pair, between) in pairs {
         if let Some(Ok(joined)) = joins.get(pair) {
@@ -373,21 +373,7 @@ fn weigh(
         }
         _ => f64::NAN,
     };
-    let verdict = if weight >= 0.5 {
-        LoopVerdict::Used
-    } else if contradicts {
-        LoopVerdict::Inconsistent
-    } else {
-        LoopVerdict::LargeResidual { squared_error, limit: settings.robust.squared_error_6dof }
-    };
-    LoopWeight {
-        key: edge.key.clone(),
-        from: edge.from.clone(),
-        to: edge.to.clone(),
-        weight,
-        squared_error,
-        verdict,
-    }
+    LoopWeight::judged(edge, weight, squared_error, contradicts, settings)
 }
 
 /// Loops whose ends ended up in different components.

@@ -23,6 +23,8 @@ pub struct DpgoConfig {
     /// Entries of one graph that say something of it (submaps, odometry, verdicts, withdrawals); more are
     /// refused. One takes about 600 bytes. Default: 100000.
     pub max_facts_per_graph: usize,
+    /// Callers that may watch one graph; more are refused. Default: 16.
+    pub max_watchers_per_graph: usize,
     /// Graphs that are solved at once; none: one per core. Others wait.
     pub threads: Option<usize>,
 }
@@ -41,6 +43,7 @@ impl Default for DpgoConfig {
             max_graphs: 64,
             max_entries_per_graph: 1_000_000,
             max_facts_per_graph: 100_000,
+            max_watchers_per_graph: 16,
             threads: None,
         }
     }
@@ -56,6 +59,7 @@ impl DpgoConfig {
         within("max_graphs", self.max_graphs, 1, 10_000)?;
         within("max_entries_per_graph", self.max_entries_per_graph, 1, 100_000_000)?;
         within("max_facts_per_graph", self.max_facts_per_graph, 1, 10_000_000)?;
+        within("max_watchers_per_graph", self.max_watchers_per_graph, 1, 10_000)?;
         within("threads", self.threads.unwrap_or(1), 1, 256)
     }
 }

@@ -14,6 +14,7 @@ mod facts;
 mod graphs;
 mod logs;
 mod service;
+mod watch;
 
 pub use config::DpgoConfig;
 
@@ -52,12 +53,13 @@ impl Server {
         let (local_addr, url) = (bound.local_addr, bound.url());
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let service = DpgoService {
-            graphs: Arc::new(Graphs::new(config.max_graphs)),
+            graphs: Arc::new(Graphs::new(config.max_graphs, config.max_watchers_per_graph)),
             solver: Solver {
                 settings: config.solve,
                 work: Arc::new(Semaphore::new(config.threads.unwrap_or(cores))),
             },
             room: Room { entries: config.max_entries_per_graph, facts: config.max_facts_per_graph },
+            stopping: bound.stopping(),
         };
         let limited = DpgoServer::new(service).limited(config.server.max_message_bytes);
         let ledger = ByteLedger::default();
