@@ -371,7 +371,9 @@ impl BlockAgent {
         if !due || !self.takes_part() || self.coarse.has(self.block.id) {
             return;
         }
-        let largest = self.doubts().iter().map(|(_, squared)| *squared).fold(0.0, f64::max);
+        // What is decided shapes no one's doubts any more.
+        let undecided = if matches!(self.doubt, Doubt::Decided) { Vec::new() } else { self.doubts() };
+        let largest = undecided.iter().map(|(_, squared)| *squared).fold(0.0, f64::max);
         let summary = Summary::new(&self.block, &self.poses, &self.known, &self.weights, largest);
         if let Some(summary) = summary {
             self.coarse.take(self.coarse.round + 1, &summary);

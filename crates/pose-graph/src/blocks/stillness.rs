@@ -87,7 +87,9 @@ impl Stillness {
             return None;
         }
         let mut hasher = blake3::Hasher::new();
-        self.table.iter().for_each(|s| drop(hasher.update(&s.changes.to_le_bytes())));
+        for standing in &self.table {
+            hasher.update(&standing.changes.to_le_bytes());
+        }
         let first: [u8; 8] = hasher.finalize().as_bytes()[..8].try_into().unwrap_or_default();
         Some(u64::from_le_bytes(first).max(1))
     }
