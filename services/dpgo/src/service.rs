@@ -1,9 +1,10 @@
 //! The gRPC side: requests are checked, work goes to threads of its own, answers come back.
 
+use crate::blocks::{BlockRequest, Runs};
 use crate::graphs::{Graph, Graphs, NoAnswer, Solver};
 use crate::logs::{Full, Lacking, Room};
 use crate::watch::Watcher;
-use coma_runtime::CancellationToken;
+use coma_runtime::{CancellationToken, Class, Connection};
 use coma_wire::entries::Entry;
 use coma_wire::v1::dpgo_server::Dpgo;
 use coma_wire::{At, FieldError, Wire, limits, v1};
@@ -24,6 +25,8 @@ pub struct DpgoService {
     pub solver: Solver,
     /// How much one graph may hold.
     pub room: Room,
+    /// Blocks that are solved with others.
+    pub runs: Runs,
     /// Cancelled when the service is asked to end.
     pub stopping: CancellationToken,
 }
@@ -114,5 +117,36 @@ impl Dpgo for DpgoService {
         let graph = self.graph(&name)?;
         let watcher = Watcher::new(name, graph, self.solver.clone(), self.stopping.clone())?;
         Ok(Response::new(Box::pin(watcher.answers())))
+    }
+
+    type SolveBlockStream = Answers<v1::SolveBlockResponse>;
+
+    async fn solve_block(
+        &self,
+        request: Request<v1::SolveBlockRequest>,
+    ) -> Result<Response<Self::SolveBlockStream>, Status> {
+        let max_team = self.runs.max_team()?;
+        let mut request = request.into_inner();
+        let name = graph_name(std::mem::take(&mut request.graph))?;
+        let at_least = coma_wire::version_vector(request.at_least.take(), &At::Root("at_least"))?;
+        let request = BlockRequest::read(request, max_team)?;
+        let held = self.graph(&name)?.with_logs(|logs| match logs.lacking(&at_least) {
+            Some(what) => Err(what),
+            None => Ok(logs.graph()),
+        });
+        let held = held.map_err(|what| lacking(&name, what))?;
+        let progress = self.runs.begin(request, held.entries).await?;
+        Ok(Response::new(Box::pin(progress.answers())))
+    }
+
+    async fn put_boundary(
+        &self,
+        request: Request<v1::PutBoundaryRequest>,
+    ) -> Result<Response<v1::PutBoundaryResponse>, Status> {
+        if let Some(connection) = Connection::of(&request) {
+            connection.set_class(Class::Peer);
+        }
+        let attempt = self.runs.put(request.into_inner())?;
+        Ok(Response::new(v1::PutBoundaryResponse { attempt }))
     }
 }
