@@ -5,6 +5,7 @@ mod common;
 use coma_dpgo::{BlockConfig, DpgoConfig, Handle, Server};
 use coma_geometry::nalgebra::Vector3;
 use coma_geometry::{Pose, StampNs, SubmapId, se3};
+use coma_pose_graph::blocks::BlockSettings;
 use coma_pose_graph::residual::{residual, squared_mahalanobis};
 use coma_runtime::{Bound, ByteLedger, ServerSettings, Services};
 use coma_wire::entries::*;
@@ -18,7 +19,7 @@ use std::time::Duration;
 use tonic::{Code, Request, Response, Status, Streaming};
 
 const NAMES: [&str; 3] = ["a", "b", "c"];
-const SUBMAPS: u32 = 20;
+const SUBMAPS: u32 = 16;
 
 struct Random(u64);
 
@@ -93,7 +94,7 @@ fn noisy_team(seed: u64) -> Team {
     }
     let far = Pose::new(Vector3::new(1.5, -0.8, 0.4), Vector3::new(0.3, 1.0, 0.0));
     let wrong = [
-        team.accept("b", ("a", 4), ("b", 14), far),
+        team.accept("b", ("a", 4), ("b", 13), far),
         team.accept("c", ("b", 3), ("c", 12), far.inverse()),
     ];
     team.false_loops.extend(wrong);
@@ -158,7 +159,9 @@ fn weights(loops: &[v1::LoopWeight]) -> BTreeMap<EntryKey, f64> {
 }
 
 fn config(step_ms: u64) -> DpgoConfig {
-    let blocks = BlockConfig { enabled: true, step_ms, repeat_ms: 50, ..Default::default() };
+    // Somewhat more than what still means otherwise: enough for 0.1 % of the cost.
+    let descent = BlockSettings { still_m: 2e-5, still_rad: 2e-6, ..Default::default() };
+    let blocks = BlockConfig { enabled: true, step_ms, repeat_ms: 50, descent, ..Default::default() };
     DpgoConfig { blocks, ..Default::default() }
 }
 
@@ -327,12 +330,12 @@ impl Dpgo for PoorWay {
         if fate < 0.2 {
             return Err(lost());
         }
-        tokio::time::sleep(Duration::from_secs_f64(0.02 * delay)).await;
+        tokio::time::sleep(Duration::from_secs_f64(0.01 * delay)).await;
         if repeated {
             // Once more, and later than what comes next.
             let (message, mut to) = (message.clone(), self.to.clone());
             tokio::spawn(async move {
-                tokio::time::sleep(Duration::from_millis(30)).await;
+                tokio::time::sleep(Duration::from_millis(15)).await;
                 let _ = to.put_boundary(message).await;
             });
         }
@@ -434,7 +437,13 @@ async fn bad_requests_for_a_block_are_refused_by_field_or_with_the_reason() {
     assert_eq!(not_here.code(), Code::NotFound);
     for (change, reason) in [
         (&|r: &mut v1::SolveBlockRequest| r.at_least = Some(heads(&[&team.logs["c"]])) as _, "of c/1"),
-        (&|r: &mut v1::SolveBlockRequest| r.agent_id = "d".into(), "d has no submap"),
+        (
+            &|r: &mut v1::SolveBlockRequest| {
+                r.agent_id = "d".into();
+                r.gauge = Some(submap("b", 0).to_wire());
+            },
+            "d has no submap",
+        ),
         (&|r: &mut v1::SolveBlockRequest| r.gauge = Some(submap("a", 99).to_wire()), "gauge a/1/s99"),
         (&|r: &mut v1::SolveBlockRequest| drop(r.peers.remove(0)), "no loop to any of the others"),
     ] as [(&dyn Fn(&mut v1::SolveBlockRequest), &str); 4]
@@ -551,7 +560,7 @@ async fn garbage_from_a_neighbour_is_refused_by_field() {
             with(&|r| inner(r).summaries[0].largest_squared_error = f64::INFINITY),
         ),
         (format!("{link_at}.other"), with(&|r| link(r).other = "d".into())),
-        (format!("{link_at}.gradient"), with(&|r| drop(link(r).gradient.pop()))),
+        (format!("{link_at}.gradient"), with(&|r| link(r).gradient.truncate(5))),
         (format!("{link_at}.gradient[2]"), with(&|r| link(r).gradient[2] = f64::NAN)),
         (format!("{link_at}.hessian"), with(&|r| link(r).hessian = None)),
         ("standings[0].agent_id".into(), with(&|r| r.standings[0].agent_id = "d".into())),
