@@ -19,7 +19,7 @@ use std::time::Duration;
 use tonic::{Code, Request, Response, Status, Streaming};
 
 const NAMES: [&str; 3] = ["a", "b", "c"];
-const SUBMAPS: u32 = 16;
+const SUBMAPS: u32 = 12;
 
 struct Random(u64);
 
@@ -94,8 +94,8 @@ fn noisy_team(seed: u64) -> Team {
     }
     let far = Pose::new(Vector3::new(1.5, -0.8, 0.4), Vector3::new(0.3, 1.0, 0.0));
     let wrong = [
-        team.accept("b", ("a", 4), ("b", 13), far),
-        team.accept("c", ("b", 3), ("c", 12), far.inverse()),
+        team.accept("b", ("a", 4), ("b", 10), far),
+        team.accept("c", ("b", 3), ("c", 9), far.inverse()),
     ];
     team.false_loops.extend(wrong);
     team
@@ -160,7 +160,7 @@ fn weights(loops: &[v1::LoopWeight]) -> BTreeMap<EntryKey, f64> {
 
 fn config(step_ms: u64) -> DpgoConfig {
     // Somewhat more than what still means otherwise: enough for 0.1 % of the cost.
-    let descent = BlockSettings { still_m: 2e-5, still_rad: 2e-6, ..Default::default() };
+    let descent = BlockSettings { still_m: 3e-5, still_rad: 3e-6, ..Default::default() };
     let blocks = BlockConfig { enabled: true, step_ms, repeat_ms: 50, descent, ..Default::default() };
     DpgoConfig { blocks, ..Default::default() }
 }
@@ -330,12 +330,12 @@ impl Dpgo for PoorWay {
         if fate < 0.2 {
             return Err(lost());
         }
-        tokio::time::sleep(Duration::from_secs_f64(0.01 * delay)).await;
+        tokio::time::sleep(Duration::from_secs_f64(0.004 * delay)).await;
         if repeated {
             // Once more, and later than what comes next.
             let (message, mut to) = (message.clone(), self.to.clone());
             tokio::spawn(async move {
-                tokio::time::sleep(Duration::from_millis(15)).await;
+                tokio::time::sleep(Duration::from_millis(6)).await;
                 let _ = to.put_boundary(message).await;
             });
         }
