@@ -8,6 +8,7 @@ use crate::relative::{JoinSettings, Joined, NotJoined, join};
 use crate::solution::{Component, LoopVerdict, LoopWeight, PairJoin, PairReport, Solution, pose_digest};
 use crate::solver::{Constraint, Problem, SolveError, SolverSettings};
 use coma_geometry::{AgentId, MapId, Pose, SubmapId};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -24,8 +25,8 @@ pub struct GlobalSettings {
     pub join: JoinSettings,
 }
 
-/// Solves everything that the entries hold: cold, single-threaded, in sorted order, so that equal sets of
-/// entries and settings give equal bits.
+/// Solves everything that the entries hold: cold and in sorted order, so that equal sets of entries and settings give
+/// equal bits, whatever the number of threads.
 ///
 /// Chains with enough consistent loops join (see [`join`]); each component starts from its chains laid out over
 /// a spanning tree of the T_st, and is solved over odometry and all its loops with robust weights. The gauge is
@@ -36,8 +37,9 @@ pub fn solve(entries: &GraphEntries, settings: &GlobalSettings) -> Solution {
     let chain_of = chain_of(&chains);
     let pairs = chain_pairs(&graph.loops, &chain_of);
     let trunks = lay_out(&chains, &graph.loops, &chain_of, &pairs, settings);
-    let joins: BTreeMap<(usize, usize), Result<Joined, NotJoined>> = pairs
-        .iter()
+    // Pairs know nothing of each other: which thread takes which does not matter.
+    let joins: Joins = pairs
+        .par_iter()
         .map(|(&(s, t), between)| {
             let outcome = relate(between, &trunks[s], &trunks[t], &graph.nodes, settings);
             ((s, t), outcome)
@@ -85,7 +87,10 @@ pub(crate) fn chain_within(chain_of: &ChainOf, edge: &Edge) -> Option<usize> {
     (from == to).then_some(*from)
 }
 
-pub(crate) fn chain_pairs<'a>(loops: &'a [Edge], chain_of: &ChainOf) -> BTreeMap<(usize, usize), Between<'a>> {
+pub(crate) fn chain_pairs<'a>(
+    loops: &'a [Edge],
+    chain_of: &ChainOf,
+) -> BTreeMap<(usize, usize), Between<'a>> {
     let mut pairs: BTreeMap<(usize, usize), Between> = BTreeMap::new();
     for edge in loops {
         if let (Some(&a), Some(&b)) = (chain_of.get(&edge.from), chain_of.get(&edge.to))
@@ -133,7 +138,7 @@ pub(crate) fn lay_out(
         }
         trunk
     };
-    chains.iter().enumerate().map(lay_out_one).collect()
+    chains.par_iter().enumerate().map(lay_out_one).collect()
 }
 
 pub(crate) fn relate(

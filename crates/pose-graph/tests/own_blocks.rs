@@ -114,15 +114,12 @@ fn assert_agrees(world: &World, blocks: &[OwnBlock], agents: &[BlockAgent]) {
 }
 
 fn blocks_of(world: &World) -> Vec<OwnBlock> {
-    vec![
-        own(world, "a", &["a", "b"]),
-        own(world, "b", &["a", "b", "c"]),
-        own(world, "c", &["b", "c"]),
-    ]
+    vec![own(world, "a", &["a", "b"]), own(world, "b", &["a", "b", "c"]), own(world, "c", &["b", "c"])]
 }
 
 fn agents_of(blocks: &[OwnBlock]) -> Vec<BlockAgent> {
-    let begin = |b: &OwnBlock| BlockAgent::new(b.block.clone(), |_| Pose::identity(), BlockSettings::default());
+    let begin =
+        |b: &OwnBlock| BlockAgent::new(b.block.clone(), |_| Pose::identity(), BlockSettings::default());
     blocks.iter().map(begin).collect()
 }
 

@@ -38,7 +38,7 @@ pub struct DpgoConfig {
 pub struct BlockConfig {
     /// Take part: it then calls the dpgo services that requests name. Default: no.
     pub enabled: bool,
-    /// How it calls them.
+    /// How it calls them; its token goes to every address that a request names.
     pub client: ClientSettings,
     /// How a block descends. Services that solve together need equal ones.
     pub descent: BlockSettings,
@@ -106,7 +106,10 @@ impl DpgoConfig {
         within("blocks.step_ms", self.blocks.step_ms as usize, 0, 60_000)?;
         within("blocks.repeat_ms", self.blocks.repeat_ms as usize, 1, 60_000)?;
         let longest = self.blocks.max_run_s;
-        ensure!(longest > 0.0 && longest <= 1e6, "blocks.max_run_s = {longest} must be over 0 and at most 1e6");
+        ensure!(
+            longest > 0.0 && longest <= 1e6,
+            "blocks.max_run_s = {longest} must be over 0 and at most 1e6"
+        );
         within("threads", self.threads.unwrap_or(1), 1, 256)
     }
 }

@@ -21,10 +21,10 @@ mod watch;
 
 pub use config::{BlockConfig, DpgoConfig};
 
+use blocks::Runs;
 use coma_runtime::{Bound, ByteLedger, Services};
 use coma_wire::v1::dpgo_server::DpgoServer;
 use coma_wire::{FILE_DESCRIPTOR_SET, Limited};
-use blocks::Runs;
 use graphs::{Graphs, Solver};
 use logs::Room;
 use service::DpgoService;
@@ -61,18 +61,8 @@ impl Server {
         let largest = config.server.max_message_bytes;
         let service = DpgoService {
             graphs: Arc::new(Graphs::new(config.max_graphs, config.max_watchers_per_graph)),
-            solver: Solver {
-                settings: config.solve,
-                work: work.clone(),
-            },
-            runs: Runs::new(
-                config.blocks,
-                config.solve,
-                largest,
-                ledger.clone(),
-                work,
-                bound.stopping(),
-            ),
+            solver: Solver { settings: config.solve, work: work.clone() },
+            runs: Runs::new(config.blocks, config.solve, largest, ledger.clone(), work, bound.stopping()),
             room: Room { entries: config.max_entries_per_graph, facts: config.max_facts_per_graph },
             stopping: bound.stopping(),
         };

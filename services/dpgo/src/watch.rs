@@ -59,7 +59,16 @@ impl Watcher {
             Status::resource_exhausted(message)
         })?;
         let changes = graph.changes();
-        Ok(Watcher { name, graph, solver, changes, sent: None, stopping, _place: place, _counted: Counted::one() })
+        Ok(Watcher {
+            name,
+            graph,
+            solver,
+            changes,
+            sent: None,
+            stopping,
+            _place: place,
+            _counted: Counted::one(),
+        })
     }
 
     /// Answers until the graph or the service ends.

@@ -93,10 +93,8 @@ fn noisy_team(seed: u64) -> Team {
         team.accept("c", ("b", n), ("c", (n + 1) % SUBMAPS), half(random.error()));
     }
     let far = Pose::new(Vector3::new(1.5, -0.8, 0.4), Vector3::new(0.3, 1.0, 0.0));
-    let wrong = [
-        team.accept("b", ("a", 4), ("b", 10), far),
-        team.accept("c", ("b", 3), ("c", 9), far.inverse()),
-    ];
+    let wrong =
+        [team.accept("b", ("a", 4), ("b", 10), far), team.accept("c", ("b", 3), ("c", 9), far.inverse())];
     team.false_loops.extend(wrong);
     team
 }
@@ -105,11 +103,8 @@ impl Team {
     fn accept(&mut self, author: &str, from: (&str, u32), to: (&str, u32), error: Pose) -> EntryKey {
         let (from, to) = (submap(from.0, from.1), submap(to.0, to.1));
         let from_from_to = between(&from, &to) * error;
-        let outcome = LoopOutcome::Accepted {
-            from_from_to,
-            information: information(),
-            numbers: BTreeMap::new(),
-        };
+        let outcome =
+            LoopOutcome::Accepted { from_from_to, information: information(), numbers: BTreeMap::new() };
         let (similarity, space) = (0.9, "builtin/1".into());
         let verdict = LoopVerdict { from: from.clone(), to: to.clone(), similarity, space, outcome };
         let key = self.logs.get_mut(author).unwrap().write(Payload::LoopVerdict(verdict));

@@ -125,10 +125,8 @@ async fn a_watcher_ends_with_its_graph_and_with_the_service() {
     let mut corrections = watch(&mut client, "y").await.unwrap();
     next(&mut corrections).await;
     // Long before the grace time.
-    let (ended, down) = tokio::join!(
-        corrections.message(),
-        tokio::time::timeout(Duration::from_secs(30), handle.shutdown())
-    );
+    let (ended, down) =
+        tokio::join!(corrections.message(), tokio::time::timeout(Duration::from_secs(30), handle.shutdown()));
     assert_eq!(ended.unwrap_err().code(), Code::Unavailable);
     down.expect("nobody is waited for");
 }

@@ -561,9 +561,8 @@ impl BlockAgent {
             Trust::Doubted => true,
             Trust::Suspended => suspended_too,
         };
-        let asked = |k: &usize| {
-            doubted(self.block.edges[*k].trust) && self.decides(&self.block.edges[*k].constraint)
-        };
+        let asked =
+            |k: &usize| doubted(self.block.edges[*k].trust) && self.decides(&self.block.edges[*k].constraint);
         let edges = (0..self.block.edges.len()).filter(asked);
         edges.filter_map(|k| Some((k, self.squared_error(k)?))).collect()
     }

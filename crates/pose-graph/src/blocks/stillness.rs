@@ -64,16 +64,16 @@ impl Stillness {
     pub fn say(&mut self, still: bool) {
         let Some(own) = self.table.get_mut(self.own as usize) else { return };
         if own.still != still {
-            *own = Standing {
-                edition: own.edition + 1,
-                changes: own.changes + 1,
-                still,
-                confirmed: 0,
-                ..*own
-            };
+            *own =
+                Standing { edition: own.edition + 1, changes: own.changes + 1, still, confirmed: 0, ..*own };
             self.version += 1;
         }
         self.confirm();
+    }
+
+    /// True if all blocks are still as far as this one knows: the end may be near.
+    pub fn seems_over(&self) -> bool {
+        self.name().is_some()
     }
 
     /// True if all blocks were still at one moment.

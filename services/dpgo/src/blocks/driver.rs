@@ -70,6 +70,8 @@ pub struct Driver {
     /// How long to wait before what was not acknowledged is said again.
     pub(super) repeat: Duration,
     pub(super) longest: Duration,
+    /// When standings were last told without a boundary.
+    pub(super) standings_told: Instant,
 }
 
 /// Why a run ends.
@@ -166,16 +168,22 @@ impl Driver {
         out.map_err(|e: SolveError| Status::internal(format!("the block cannot be solved: {e}")))
     }
 
-    /// Leaves letters for the neighbours: boundaries, and standings for those that lack the newest.
-    fn post(&self, out: Vec<(BlockId, Boundary)>) {
+    /// Leaves letters for the neighbours: boundaries, and what is known of all. The latter is for the end: a block that
+    /// moves does not tell it, and one that is still tells it by itself only now and then until all seem to be still.
+    fn post(&mut self, out: Vec<(BlockId, Boundary)>) {
         let Some(part) = &self.part else { return };
         let version = part.stillness.version();
-        let standings: Vec<v1::Standing> =
-            part.stillness.told().map(|s| self.run.team.standing(s)).collect();
+        let told = part.stillness.told().filter(|_| part.agent.is_still());
+        let standings: Vec<v1::Standing> = told.map(|s| self.run.team.standing(s)).collect();
+        let due = part.stillness.seems_over() || self.standings_told.elapsed() >= self.repeat;
+        let by_itself = due && part.agent.is_still();
+        if by_itself {
+            self.standings_told = Instant::now();
+        }
         let mut boundaries: BTreeMap<BlockId, Boundary> = out.into_iter().collect();
         for (to, slot) in &self.slots {
             let boundary = boundaries.remove(to);
-            if boundary.is_none() && self.run.has(*to, (part.attempt, version)) {
+            if boundary.is_none() && (!by_itself || self.run.has(*to, (part.attempt, version))) {
                 continue;
             }
             let request = v1::PutBoundaryRequest {
@@ -188,6 +196,7 @@ impl Driver {
                 boundary: boundary.map(|b| self.run.names.boundary(&b, &self.run.team)),
                 standings: standings.clone(),
             };
+            let version = if part.agent.is_still() { version } else { 0 };
             slot.put(Letter { request, version });
         }
     }

@@ -169,6 +169,7 @@ impl Runs {
             step: Duration::from_millis(self.config.step_ms),
             repeat: Duration::from_millis(self.config.repeat_ms),
             longest: Duration::from_secs_f64(self.config.max_run_s),
+            standings_told: tokio::time::Instant::now(),
         };
         let runs = self.clone();
         tokio::spawn(async move {
@@ -188,9 +189,10 @@ impl Runs {
         let found = self.lock().get(&name).cloned();
         match found {
             Some(run) => run.put(request),
-            None => {
-                Err(Status::not_found(format!("the block of {} in {:?} is not being solved here", name.1, name.0)))
-            }
+            None => Err(Status::not_found(format!(
+                "the block of {} in {:?} is not being solved here",
+                name.1, name.0
+            ))),
         }
     }
 
@@ -202,7 +204,9 @@ impl Runs {
         let mut shelf = self.lock();
         if !shelf.contains_key(&run.name) && shelf.len() >= self.config.max_runs {
             let most = self.config.max_runs;
-            return Err(Status::resource_exhausted(format!("{most} blocks are being solved: blocks.max_runs")));
+            return Err(Status::resource_exhausted(format!(
+                "{most} blocks are being solved: blocks.max_runs"
+            )));
         }
         if let Some(older) = shelf.insert(run.name.clone(), run.clone()) {
             older.replaced.cancel();

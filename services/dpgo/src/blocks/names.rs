@@ -127,7 +127,11 @@ impl Team {
 }
 
 fn within(value: f64, at: &At<'_>) -> Result<f64, FieldError> {
-    if value.abs() <= MOST { Ok(value) } else { Err(at.refuse(format!("{value} is not finite or over 1e30"))) }
+    if value.abs() <= MOST {
+        Ok(value)
+    } else {
+        Err(at.refuse(format!("{value} is not finite or over 1e30")))
+    }
 }
 
 /// The names of one block's nodes and loops.
