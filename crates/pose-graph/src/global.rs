@@ -8,6 +8,7 @@ use crate::relative::{JoinSettings, Joined, NotJoined, join};
 use crate::solution::{Component, LoopVerdict, LoopWeight, PairJoin, PairReport, Solution, pose_digest};
 use crate::solver::{Constraint, Problem, SolveError, SolverSettings};
 use coma_geometry::{AgentId, MapId, Pose, SubmapId};
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
@@ -24,8 +25,8 @@ pub struct GlobalSettings {
     pub join: JoinSettings,
 }
 
-/// Solves everything that the entries hold: cold, single-threaded, in sorted order, so that equal sets of
-/// entries and settings give equal bits.
+/// Solves everything that the entries hold: cold and in sorted order, so that equal sets of entries and settings give
+/// equal bits, whatever the number of threads.
 ///
 /// Chains with enough consistent loops join (see [`join`]); each component starts from its chains laid out over
 /// a spanning tree of the T_st, and is solved over odometry and all its loops with robust weights. The gauge is
@@ -36,8 +37,9 @@ pub fn solve(entries: &GraphEntries, settings: &GlobalSettings) -> Solution {
     let chain_of = chain_of(&chains);
     let pairs = chain_pairs(&graph.loops, &chain_of);
     let trunks = lay_out(&chains, &graph.loops, &chain_of, &pairs, settings);
-    let joins: BTreeMap<(usize, usize), Result<Joined, NotJoined>> = pairs
-        .iter()
+    // Pairs know nothing of each other: which thread takes which does not matter.
+    let joins: Joins = pairs
+        .par_iter()
         .map(|(&(s, t), between)| {
             let outcome = relate(between, &trunks[s], &trunks[t], &graph.nodes, settings);
             ((s, t), outcome)
@@ -65,13 +67,13 @@ pub fn solve(entries: &GraphEntries, settings: &GlobalSettings) -> Solution {
 }
 
 /// The loops between two chains, by key, each with whether it starts in the first of them.
-type Between<'a> = Vec<(&'a Edge, bool)>;
-type Joins = BTreeMap<(usize, usize), Result<Joined, NotJoined>>;
+pub(crate) type Between<'a> = Vec<(&'a Edge, bool)>;
+pub(crate) type Joins = BTreeMap<(usize, usize), Result<Joined, NotJoined>>;
 
 /// The chain that holds each submap.
-type ChainOf<'a> = BTreeMap<&'a SubmapId, usize>;
+pub(crate) type ChainOf<'a> = BTreeMap<&'a SubmapId, usize>;
 
-fn chain_of(chains: &[Chain]) -> ChainOf<'_> {
+pub(crate) fn chain_of(chains: &[Chain]) -> ChainOf<'_> {
     let mut out = ChainOf::new();
     for (index, chain) in chains.iter().enumerate() {
         out.extend(chain.submaps.iter().map(|s| (s, index)));
@@ -80,12 +82,15 @@ fn chain_of(chains: &[Chain]) -> ChainOf<'_> {
 }
 
 /// The chain that holds both ends of a loop.
-fn chain_within(chain_of: &ChainOf, edge: &Edge) -> Option<usize> {
+pub(crate) fn chain_within(chain_of: &ChainOf, edge: &Edge) -> Option<usize> {
     let (from, to) = (chain_of.get(&edge.from)?, chain_of.get(&edge.to)?);
     (from == to).then_some(*from)
 }
 
-fn chain_pairs<'a>(loops: &'a [Edge], chain_of: &ChainOf) -> BTreeMap<(usize, usize), Between<'a>> {
+pub(crate) fn chain_pairs<'a>(
+    loops: &'a [Edge],
+    chain_of: &ChainOf,
+) -> BTreeMap<(usize, usize), Between<'a>> {
     let mut pairs: BTreeMap<(usize, usize), Between> = BTreeMap::new();
     for edge in loops {
         if let (Some(&a), Some(&b)) = (chain_of.get(&edge.from), chain_of.get(&edge.to))
@@ -98,7 +103,7 @@ fn chain_pairs<'a>(loops: &'a [Edge], chain_of: &ChainOf) -> BTreeMap<(usize, us
 }
 
 /// Lays every chain out by its odometry, and those that may join another one by their own loops too.
-fn lay_out(
+pub(crate) fn lay_out(
     chains: &[Chain],
     loops: &[Edge],
     chain_of: &ChainOf,
@@ -133,10 +138,10 @@ fn lay_out(
         }
         trunk
     };
-    chains.iter().enumerate().map(lay_out_one).collect()
+    chains.par_iter().enumerate().map(lay_out_one).collect()
 }
 
-fn relate(
+pub(crate) fn relate(
     between: &Between,
     s: &Trunk,
     t: &Trunk,
@@ -336,7 +341,7 @@ fn solve_component(
 }
 
 /// Loops in the consistent set of a pair of chains that joined.
-fn supported(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
+pub(crate) fn supported(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
     let mut out = BTreeSet::new();
     for (pair, between) in pairs {
         if let Some(Ok(joined)) = joins.get(pair) {
@@ -348,7 +353,7 @@ fn supported(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeS
 }
 
 /// Loops that do not belong to the consistent set of a pair of chains that joined.
-fn contradicting(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
+pub(crate) fn contradicting(pairs: &BTreeMap<(usize, usize), Between>, joins: &Joins) -> BTreeSet<EdgeKey> {
     let mut out = BTreeSet::new();
     for (pair, between) in pairs {
         if let Some(Ok(joined)) = joins.get(pair) {
@@ -373,21 +378,7 @@ fn weigh(
         }
         _ => f64::NAN,
     };
-    let verdict = if weight >= 0.5 {
-        LoopVerdict::Used
-    } else if contradicts {
-        LoopVerdict::Inconsistent
-    } else {
-        LoopVerdict::LargeResidual { squared_error, limit: settings.robust.squared_error_6dof }
-    };
-    LoopWeight {
-        key: edge.key.clone(),
-        from: edge.from.clone(),
-        to: edge.to.clone(),
-        weight,
-        squared_error,
-        verdict,
-    }
+    LoopWeight::judged(edge, weight, squared_error, contradicts, settings)
 }
 
 /// Loops whose ends ended up in different components.

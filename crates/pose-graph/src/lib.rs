@@ -13,8 +13,8 @@
 //! * [`blocks`]: the same without anyone who holds the whole graph.
 //! * [`covariance`]: how sure a pose is. [`g2o`], [`team`]: files.
 //!
-//! Everything is `f64`, single-threaded, and a function of its arguments: the same entries in any order
-//! give the same bits.
+//! Everything is `f64` and a function of its arguments: the same entries in any order, on any number of threads, give the
+//! same bits.
 
 #![allow(
     clippy::neg_cmp_op_on_partial_ord,

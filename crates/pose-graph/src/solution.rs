@@ -1,6 +1,7 @@
 //! What a solve gives: components, each with a frame, poses, and what became of every loop.
 
-use crate::graph::{Cut, EdgeKey, EntryName, EntryProblem};
+use crate::global::GlobalSettings;
+use crate::graph::{Cut, Edge, EdgeKey, EntryName, EntryProblem};
 use crate::relative::NotJoined;
 use coma_geometry::{AgentId, MapId, Pose, SubmapId};
 use std::collections::{BTreeMap, BTreeSet};
@@ -56,6 +57,33 @@ pub struct LoopWeight {
     pub squared_error: f64,
     /// What became of it.
     pub verdict: LoopVerdict,
+}
+
+impl LoopWeight {
+    /// Says what became of a loop; `contradicts` if it contradicts those that joined its chains.
+    pub(crate) fn judged(
+        edge: &Edge,
+        weight: f64,
+        squared_error: f64,
+        contradicts: bool,
+        settings: &GlobalSettings,
+    ) -> LoopWeight {
+        let verdict = if weight >= 0.5 {
+            LoopVerdict::Used
+        } else if contradicts {
+            LoopVerdict::Inconsistent
+        } else {
+            LoopVerdict::LargeResidual { squared_error, limit: settings.robust.squared_error_6dof }
+        };
+        LoopWeight {
+            key: edge.key.clone(),
+            from: edge.from.clone(),
+            to: edge.to.clone(),
+            weight,
+            squared_error,
+            verdict,
+        }
+    }
 }
 
 /// Submaps that share a frame.

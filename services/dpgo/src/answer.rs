@@ -3,7 +3,8 @@
 use crate::facts::Graph;
 use coma_geometry::{AgentId, SubmapId};
 use coma_pose_graph::graph::EntryName;
-use coma_pose_graph::{Component, EdgeKey, Solution};
+use coma_pose_graph::relative::NotJoined;
+use coma_pose_graph::{Component, EdgeKey, LoopWeight, Solution};
 use coma_wire::entries::{EntryKey, VersionVector};
 use coma_wire::{Wire, v1};
 use std::collections::{BTreeMap, BTreeSet};
@@ -17,11 +18,12 @@ pub fn answer(graph: &Graph, solution: &Solution) -> v1::SolveResponse {
     v1::SolveResponse {
         components: solution.components.iter().map(|c| component(c, &cut)).collect(),
         rejected_entries: rejected(graph, solution),
-        not_joined: not_joined(graph, solution),
+        not_joined: all_not_joined(graph, solution),
     }
 }
 
-fn entry_key(key: &EdgeKey) -> v1::EntryKey {
+/// An entry's name.
+pub fn entry_key(key: &EdgeKey) -> v1::EntryKey {
     EntryKey { agent: key.agent.clone(), epoch: key.epoch, sequence: key.sequence }.to_wire()
 }
 
@@ -52,20 +54,35 @@ fn component(component: &Component, cut: &VersionVector) -> v1::Component {
                 map_from_submap: Some(pose.to_wire()),
             })
             .collect(),
-        loops: component
-            .loops
-            .iter()
-            .map(|l| v1::LoopWeight {
-                verdict: Some(entry_key(&l.key)),
-                from: Some(l.from.to_wire()),
-                to: Some(l.to.to_wire()),
-                weight: l.weight,
-                squared_error: l.squared_error,
-                message: l.verdict.to_string(),
-            })
-            .collect(),
+        loops: component.loops.iter().map(loop_weight).collect(),
         cost: component.cost,
         iterations: component.iterations,
+    }
+}
+
+/// What became of a loop.
+pub fn loop_weight(l: &LoopWeight) -> v1::LoopWeight {
+    v1::LoopWeight {
+        verdict: Some(entry_key(&l.key)),
+        from: Some(l.from.to_wire()),
+        to: Some(l.to.to_wire()),
+        weight: l.weight,
+        squared_error: l.squared_error,
+        message: l.verdict.to_string(),
+    }
+}
+
+/// Two chains, by their first submaps, that did not join.
+pub fn not_joined(s: &SubmapId, t: &SubmapId, reason: &NotJoined) -> v1::NotJoined {
+    // A part of a run that begins later says where.
+    let part = |first: &SubmapId| match first.number {
+        0 => String::new(),
+        _ => format!(" (part of {} that begins with {first})", first.agent),
+    };
+    v1::NotJoined {
+        agent_a: s.agent.to_wire(),
+        agent_b: t.agent.to_wire(),
+        message: format!("{reason}{}{}", part(s), part(t)),
     }
 }
 
@@ -91,7 +108,7 @@ fn rejected(graph: &Graph, solution: &Solution) -> Vec<v1::RejectedEntry> {
 }
 
 /// Pairs of agents, or of parts of their runs, that are in different components, each with its reason.
-fn not_joined(graph: &Graph, solution: &Solution) -> Vec<v1::NotJoined> {
+fn all_not_joined(graph: &Graph, solution: &Solution) -> Vec<v1::NotJoined> {
     let component_of =
         |submap: &SubmapId| solution.components.iter().position(|c| c.map_from_submap.contains_key(submap));
     let mut out = Vec::new();
@@ -102,16 +119,7 @@ fn not_joined(graph: &Graph, solution: &Solution) -> Vec<v1::NotJoined> {
             continue;
         }
         explained.insert((&pair.s.agent, &pair.t.agent));
-        // A part of a run that begins later says where.
-        let part = |first: &SubmapId| match first.number {
-            0 => String::new(),
-            _ => format!(" (part of {} that begins with {first})", first.agent),
-        };
-        out.push(v1::NotJoined {
-            agent_a: pair.s.agent.to_wire(),
-            agent_b: pair.t.agent.to_wire(),
-            message: format!("{reason}{}{}", part(&pair.s), part(&pair.t)),
-        });
+        out.push(not_joined(&pair.s, &pair.t, reason));
     }
     let agents = graph.agents();
     let pairs = agents.iter().enumerate().flat_map(|(i, a)| agents[i + 1..].iter().map(move |b| (a, b)));

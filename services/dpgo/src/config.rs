@@ -2,7 +2,8 @@
 
 use anyhow::ensure;
 use coma_pose_graph::GlobalSettings;
-use coma_runtime::{Class, LogSettings, ServerSettings};
+use coma_pose_graph::blocks::BlockSettings;
+use coma_runtime::{Class, ClientSettings, LogSettings, ServerSettings};
 use serde::Deserialize;
 
 /// Settings of a dpgo service; every one has a default, and `COMA_DPGO__NAME=value` overrides the file.
@@ -23,8 +24,49 @@ pub struct DpgoConfig {
     /// Entries of one graph that say something of it (submaps, odometry, verdicts, withdrawals); more are
     /// refused. One takes about 600 bytes. Default: 100000.
     pub max_facts_per_graph: usize,
+    /// Callers that may watch one graph; more are refused. Default: 16.
+    pub max_watchers_per_graph: usize,
+    /// Solving block by block with other dpgo services.
+    pub blocks: BlockConfig,
     /// Graphs that are solved at once; none: one per core. Others wait.
     pub threads: Option<usize>,
+}
+
+/// How this service solves block by block with others.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BlockConfig {
+    /// Take part: it then calls the dpgo services that requests name. Default: no.
+    pub enabled: bool,
+    /// How it calls them; its token goes to every address that a request names.
+    pub client: ClientSettings,
+    /// How a block descends. Services that solve together need equal ones.
+    pub descent: BlockSettings,
+    /// Blocks that are solved at once; more are refused. Default: 16.
+    pub max_runs: usize,
+    /// Agents in one solve. Default: 1024.
+    pub max_team: usize,
+    /// Shortest time between two steps of a block, milliseconds. Default: 5.
+    pub step_ms: u64,
+    /// How long before what a neighbour has not acknowledged is said again, milliseconds. Default: 200.
+    pub repeat_ms: u64,
+    /// Longest solve, seconds; it ends with DEADLINE_EXCEEDED. Default: 600.
+    pub max_run_s: f64,
+}
+
+impl Default for BlockConfig {
+    fn default() -> Self {
+        BlockConfig {
+            enabled: false,
+            client: ClientSettings::default(),
+            descent: BlockSettings::default(),
+            max_runs: 16,
+            max_team: 1024,
+            step_ms: 5,
+            repeat_ms: 200,
+            max_run_s: 600.0,
+        }
+    }
 }
 
 impl Default for DpgoConfig {
@@ -41,6 +83,8 @@ impl Default for DpgoConfig {
             max_graphs: 64,
             max_entries_per_graph: 1_000_000,
             max_facts_per_graph: 100_000,
+            max_watchers_per_graph: 16,
+            blocks: BlockConfig::default(),
             threads: None,
         }
     }
@@ -56,6 +100,16 @@ impl DpgoConfig {
         within("max_graphs", self.max_graphs, 1, 10_000)?;
         within("max_entries_per_graph", self.max_entries_per_graph, 1, 100_000_000)?;
         within("max_facts_per_graph", self.max_facts_per_graph, 1, 10_000_000)?;
+        within("max_watchers_per_graph", self.max_watchers_per_graph, 1, 10_000)?;
+        within("blocks.max_runs", self.blocks.max_runs, 1, 10_000)?;
+        within("blocks.max_team", self.blocks.max_team, 1, 4096)?;
+        within("blocks.step_ms", self.blocks.step_ms as usize, 0, 60_000)?;
+        within("blocks.repeat_ms", self.blocks.repeat_ms as usize, 1, 60_000)?;
+        let longest = self.blocks.max_run_s;
+        ensure!(
+            longest > 0.0 && longest <= 1e6,
+            "blocks.max_run_s = {longest} must be over 0 and at most 1e6"
+        );
         within("threads", self.threads.unwrap_or(1), 1, 256)
     }
 }

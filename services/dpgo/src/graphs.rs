@@ -3,6 +3,7 @@
 use crate::answer::answer;
 use crate::logs::{Lacking, Logs};
 use coma_pose_graph::GlobalSettings;
+use coma_runtime::CancellationToken;
 use coma_wire::entries::VersionVector;
 use coma_wire::v1;
 use futures::FutureExt;
@@ -10,13 +11,12 @@ use futures::future::{BoxFuture, Shared};
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, watch};
 use tracing::{info, warn};
 
 /// A solve that runs or has run: whoever waits for it gets the same answer.
 type Solving = Shared<BoxFuture<'static, Result<Arc<v1::SolveResponse>, String>>>;
 
-/// One caller's graph.
 #[derive(Default)]
 struct State {
     logs: Logs,
@@ -25,8 +25,15 @@ struct State {
 }
 
 /// One caller's graph.
-#[derive(Default)]
-pub struct Graph(Mutex<State>);
+pub struct Graph {
+    state: Mutex<State>,
+    /// The version of the logs.
+    changed: watch::Sender<u64>,
+    /// Room for those who watch it.
+    pub watchers: Arc<Semaphore>,
+    /// Cancelled when it made room for another graph.
+    pub dropped: CancellationToken,
+}
 
 /// Why there is no answer.
 #[derive(Debug)]
@@ -47,13 +54,31 @@ pub struct Solver {
 }
 
 impl Graph {
+    fn new(max_watchers: usize) -> Self {
+        Graph {
+            state: Mutex::default(),
+            changed: watch::Sender::new(0),
+            watchers: Arc::new(Semaphore::new(max_watchers)),
+            dropped: CancellationToken::new(),
+        }
+    }
+
     fn lock(&self) -> MutexGuard<'_, State> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Does something with the logs. Never held across an await.
     pub fn with_logs<T>(&self, f: impl FnOnce(&mut Logs) -> T) -> T {
-        f(&mut self.lock().logs)
+        let logs = &mut self.lock().logs;
+        let out = f(logs);
+        let version = logs.version();
+        self.changed.send_if_modified(|known| std::mem::replace(known, version) != version);
+        out
+    }
+
+    /// Tells when something that a solve takes has changed.
+    pub fn changes(&self) -> watch::Receiver<u64> {
+        self.changed.subscribe()
     }
 
     /// The cold solve of what the graph holds, which is at least `at_least`. A graph that was solved as it is gives
@@ -80,7 +105,8 @@ impl Graph {
                     // Of an older state, and still running: its turn first.
                     Some((_, solving)) if solving.peek().is_none() => (false, solving.clone()),
                     _ => {
-                        let solving = begin(state.logs.graph(), solver.clone());
+                        let before = state.solving.as_ref().and_then(|(_, s)| s.peek()?.clone().ok());
+                        let solving = begin(state.logs.graph(), before, solver.clone());
                         state.solving = Some((version, solving.clone()));
                         (true, solving)
                     }
@@ -94,8 +120,8 @@ impl Graph {
     }
 }
 
-/// Starts a solve on a thread of its own.
-fn begin(graph: crate::facts::Graph, solver: Solver) -> Solving {
+/// Starts a solve on a thread of its own; `before` is the graph's answer before this one.
+fn begin(graph: crate::facts::Graph, before: Option<Arc<v1::SolveResponse>>, solver: Solver) -> Solving {
     let task = tokio::spawn(async move {
         let permit = solver.work.acquire_owned().await.map_err(|_| "the service is ending".to_owned())?;
         let solve = move || {
@@ -104,7 +130,14 @@ fn begin(graph: crate::facts::Graph, solver: Solver) -> Solving {
             let solution = coma_pose_graph::solve(&graph.entries, &solver.settings);
             let seconds = begin.elapsed().as_secs_f64();
             report(&graph, &solution, seconds);
-            Arc::new(answer(&graph, &solution))
+            let answer = answer(&graph, &solution);
+            let is_new = |c: &&v1::Component| {
+                let mut known = before.iter().flat_map(|b| &b.components);
+                !known.any(|b| b.generation == c.generation)
+            };
+            let generations = answer.components.iter().filter(is_new).count();
+            metrics::counter!("coma_dpgo_generations_total").increment(generations as u64);
+            Arc::new(answer)
         };
         tokio::task::spawn_blocking(solve).await.map_err(|e| format!("the solver ended badly: {e}"))
     });
@@ -119,7 +152,9 @@ fn report(graph: &crate::facts::Graph, solution: &coma_pose_graph::Solution, sec
     metrics::gauge!("coma_dpgo_graph_submaps").set(submaps as f64);
     metrics::gauge!("coma_dpgo_graph_edges").set(edges as f64);
     metrics::gauge!("coma_dpgo_graph_components").set(components as f64);
-    info!(submaps, edges, components, seconds, "graph solved");
+    let cost: f64 = solution.components.iter().map(|c| c.cost).sum();
+    metrics::gauge!("coma_dpgo_graph_cost").set(cost);
+    info!(submaps, edges, components, cost, seconds, "graph solved");
     for component in &solution.components {
         if let Some(failure) = &component.failure {
             warn!(map = %component.map_id, failure, "a component keeps the poses that the solve started from");
@@ -138,13 +173,14 @@ struct Shelf {
 /// The graphs of all callers, by name; the least recently used one makes room for a new one.
 pub struct Graphs {
     max_graphs: usize,
+    max_watchers_per_graph: usize,
     shelf: Mutex<Shelf>,
 }
 
 impl Graphs {
     /// None yet.
-    pub fn new(max_graphs: usize) -> Self {
-        Graphs { max_graphs, shelf: Mutex::default() }
+    pub fn new(max_graphs: usize, max_watchers_per_graph: usize) -> Self {
+        Graphs { max_graphs, max_watchers_per_graph, shelf: Mutex::default() }
     }
 
     fn lock(&self) -> MutexGuard<'_, Shelf> {
@@ -173,9 +209,11 @@ impl Graphs {
                 graphs.iter().min_by_key(|(_, (used, _))| *used).map(|(name, _)| name.clone())
         {
             warn!(dropped = oldest, max_graphs = self.max_graphs, "the least recently used graph made room");
-            graphs.remove(&oldest);
+            if let Some((_, graph)) = graphs.remove(&oldest) {
+                graph.dropped.cancel();
+            }
         }
-        let graph = Arc::<Graph>::default();
+        let graph = Arc::new(Graph::new(self.max_watchers_per_graph));
         graphs.insert(name.to_owned(), (*clock, graph.clone()));
         graph
     }

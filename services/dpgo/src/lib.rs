@@ -1,22 +1,27 @@
 //! The dpgo service: entries of agents' logs in, where every submap lies out.
 //!
 //! ```text
-//! PutEntries -> logs (contiguous, hash-chained) -> facts: submaps, odometry, verdicts, withdrawals
-//! Solve      -> facts -> coma_pose_graph::solve (cold, canonical) -> answer: components, weights, reasons
+//! PutEntries       -> logs (contiguous, hash-chained) -> facts: submaps, odometry, verdicts, withdrawals
+//! Solve            -> facts -> coma_pose_graph::solve (cold, canonical) -> answer: components, weights, reasons
+//! WatchCorrections -> the answer of Solve, and again whenever its generations change
+//! SolveBlock       -> facts -> one agent's block, solved with other dpgo services over PutBoundary (blocks)
 //! ```
 //!
 //! It owns no truth: a service that was restarted has no graphs, answers `Solve` with NOT_FOUND, and its callers put
 //! their entries again. Equal entries and settings give equal bits, in whatever order they came.
 
 mod answer;
+mod blocks;
 mod config;
 mod facts;
 mod graphs;
 mod logs;
 mod service;
+mod watch;
 
-pub use config::DpgoConfig;
+pub use config::{BlockConfig, DpgoConfig};
 
+use blocks::Runs;
 use coma_runtime::{Bound, ByteLedger, Services};
 use coma_wire::v1::dpgo_server::DpgoServer;
 use coma_wire::{FILE_DESCRIPTOR_SET, Limited};
@@ -51,16 +56,17 @@ impl Server {
         let bound = Bound::bind(&config.server).await?;
         let (local_addr, url) = (bound.local_addr, bound.url());
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
-        let service = DpgoService {
-            graphs: Arc::new(Graphs::new(config.max_graphs)),
-            solver: Solver {
-                settings: config.solve,
-                work: Arc::new(Semaphore::new(config.threads.unwrap_or(cores))),
-            },
-            room: Room { entries: config.max_entries_per_graph, facts: config.max_facts_per_graph },
-        };
-        let limited = DpgoServer::new(service).limited(config.server.max_message_bytes);
+        let work = Arc::new(Semaphore::new(config.threads.unwrap_or(cores)));
         let ledger = ByteLedger::default();
+        let largest = config.server.max_message_bytes;
+        let service = DpgoService {
+            graphs: Arc::new(Graphs::new(config.max_graphs, config.max_watchers_per_graph)),
+            solver: Solver { settings: config.solve, work: work.clone() },
+            runs: Runs::new(config.blocks, config.solve, largest, ledger.clone(), work, bound.stopping()),
+            room: Room { entries: config.max_entries_per_graph, facts: config.max_facts_per_graph },
+            stopping: bound.stopping(),
+        };
+        let limited = DpgoServer::new(service).limited(largest);
         let server = bound.serve(Services::new().with(limited), FILE_DESCRIPTOR_SET, &ledger).await?;
         Ok(Handle { local_addr, url, ledger, server })
     }

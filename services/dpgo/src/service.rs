@@ -1,10 +1,15 @@
 //! The gRPC side: requests are checked, work goes to threads of its own, answers come back.
 
-use crate::graphs::{Graphs, NoAnswer, Solver};
+use crate::blocks::{BlockRequest, Runs};
+use crate::graphs::{Graph, Graphs, NoAnswer, Solver};
 use crate::logs::{Full, Lacking, Room};
+use crate::watch::Watcher;
+use coma_runtime::{CancellationToken, Class, Connection};
 use coma_wire::entries::Entry;
 use coma_wire::v1::dpgo_server::Dpgo;
 use coma_wire::{At, FieldError, Wire, limits, v1};
+use futures::Stream;
+use std::pin::Pin;
 use std::sync::Arc;
 use tonic::{Request, Response, Status};
 
@@ -20,7 +25,13 @@ pub struct DpgoService {
     pub solver: Solver,
     /// How much one graph may hold.
     pub room: Room,
+    /// Blocks that are solved with others.
+    pub runs: Runs,
+    /// Cancelled when the service is asked to end.
+    pub stopping: CancellationToken,
 }
+
+type Answers<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 /// A caller's graph: named, and not too long.
 fn graph_name(name: String) -> Result<String, FieldError> {
@@ -45,6 +56,13 @@ fn lacking(graph: &str, Lacking { life: (agent, epoch), have, needed, forked_at 
     Status::failed_precondition(format!(
         "graph {graph:?} holds {have} entries of {agent}/{epoch}, at_least asks for {needed}: {why}"
     ))
+}
+
+impl DpgoService {
+    fn graph(&self, name: &str) -> Result<Arc<Graph>, Status> {
+        let not_here = || Status::not_found(format!("graph {name:?} is not here: put the entries"));
+        self.graphs.get(name).ok_or_else(not_here)
+    }
 }
 
 #[tonic::async_trait]
@@ -81,13 +99,54 @@ impl Dpgo for DpgoService {
         let request = request.into_inner();
         let name = graph_name(request.graph)?;
         let at_least = coma_wire::version_vector(request.at_least, &At::Root("at_least"))?;
-        let Some(graph) = self.graphs.get(&name) else {
-            return Err(Status::not_found(format!("graph {name:?} is not here: put the entries")));
-        };
+        let graph = self.graph(&name)?;
         match graph.solve(&at_least, &self.solver).await {
             Ok(answer) => Ok(Response::new(answer.as_ref().clone())),
             Err(NoAnswer::Lacking(what)) => Err(lacking(&name, what)),
             Err(NoAnswer::Failed(message)) => Err(Status::internal(message)),
         }
+    }
+
+    type WatchCorrectionsStream = Answers<v1::WatchCorrectionsResponse>;
+
+    async fn watch_corrections(
+        &self,
+        request: Request<v1::WatchCorrectionsRequest>,
+    ) -> Result<Response<Self::WatchCorrectionsStream>, Status> {
+        let name = graph_name(request.into_inner().graph)?;
+        let graph = self.graph(&name)?;
+        let watcher = Watcher::new(name, graph, self.solver.clone(), self.stopping.clone())?;
+        Ok(Response::new(Box::pin(watcher.answers())))
+    }
+
+    type SolveBlockStream = Answers<v1::SolveBlockResponse>;
+
+    async fn solve_block(
+        &self,
+        request: Request<v1::SolveBlockRequest>,
+    ) -> Result<Response<Self::SolveBlockStream>, Status> {
+        let max_team = self.runs.max_team()?;
+        let mut request = request.into_inner();
+        let name = graph_name(std::mem::take(&mut request.graph))?;
+        let at_least = coma_wire::version_vector(request.at_least.take(), &At::Root("at_least"))?;
+        let request = BlockRequest::read(request, max_team)?;
+        let held = self.graph(&name)?.with_logs(|logs| match logs.lacking(&at_least) {
+            Some(what) => Err(what),
+            None => Ok(logs.graph()),
+        });
+        let held = held.map_err(|what| lacking(&name, what))?;
+        let progress = self.runs.begin(request, held.entries).await?;
+        Ok(Response::new(Box::pin(progress.answers())))
+    }
+
+    async fn put_boundary(
+        &self,
+        request: Request<v1::PutBoundaryRequest>,
+    ) -> Result<Response<v1::PutBoundaryResponse>, Status> {
+        if let Some(connection) = Connection::of(&request) {
+            connection.set_class(Class::Peer);
+        }
+        let attempt = self.runs.put(request.into_inner())?;
+        Ok(Response::new(v1::PutBoundaryResponse { attempt }))
     }
 }

@@ -5,7 +5,7 @@ use super::coarse::{Coarse, Summary};
 use super::local::Local;
 use super::message::Boundary;
 use super::{Block, BlockId, NodeId};
-use crate::gnc::{Kernel, Schedule, final_weight};
+use crate::gnc::{Kernel, Schedule, Trust, final_weight};
 use crate::solver::{Constraint, SolveError, SolverSettings};
 use coma_geometry::{Pose, Tangent, se3};
 use serde::{Deserialize, Serialize};
@@ -53,6 +53,8 @@ impl Default for BlockSettings {
     }
 }
 
+/// So many steps without a descent, and a coarse round is not waited for any more.
+const PATIENCE: u32 = 30;
 /// So many descents without a coarse round, and an agent goes on with its doubts alone.
 const ALONE: u32 = 200;
 const KERNEL: Kernel = Kernel::TruncatedLeastSquares;
@@ -125,6 +127,8 @@ pub struct BlockAgent {
     coarse: Coarse,
     /// Descents since the last round.
     descents: u32,
+    /// Steps since the last that descended.
+    idle_steps: u32,
     /// Something was heard, or a descent is not finished.
     busy: bool,
     iterations: u64,
@@ -167,6 +171,7 @@ impl BlockAgent {
             local: None,
             coarse: Coarse::default(),
             descents: 0,
+            idle_steps: 0,
             busy: true,
             iterations: 0,
         }
@@ -197,6 +202,56 @@ impl BlockAgent {
     /// Rounds in which whole blocks moved so far.
     pub fn coarse_rounds(&self) -> u64 {
         self.coarse.round
+    }
+
+    /// `0.5 * sum of weighted squared errors` of the measurements that this block decides on, where both ends are known:
+    /// these sums of all blocks are the cost of the whole problem.
+    pub fn cost(&self) -> f64 {
+        let edges = (0..self.block.edges.len()).filter(|k| self.decides(&self.block.edges[*k].constraint));
+        let weighed = edges.filter(|k| self.weights[*k] > 0.0);
+        0.5 * weighed.filter_map(|k| Some(self.weights[k] * self.squared_error(k)?)).sum::<f64>()
+    }
+
+    /// Squared error of a measurement of the block, by its index in the whole problem, where both ends are known.
+    pub fn squared_error_of(&self, index: u32) -> Option<f64> {
+        let found = self.block.edges.binary_search_by_key(&index, |e| e.index).ok()?;
+        self.squared_error(found)
+    }
+
+    /// The blocks that it has measurements to.
+    pub fn neighbours(&self) -> impl Iterator<Item = BlockId> + '_ {
+        self.neighbours.keys().copied()
+    }
+
+    /// True if the next step descends.
+    pub fn is_busy(&self) -> bool {
+        self.busy
+    }
+
+    /// True if this block would not move by itself, every neighbour has heard where it is, and no round in which whole
+    /// blocks move is on its way. A round that does not come together, because a block takes no part, is not waited for
+    /// forever.
+    pub fn is_still(&self) -> bool {
+        let waits = self.takes_part() && self.coarse.has_begun() && self.idle_steps < PATIENCE;
+        !self.busy && !waits && self.neighbours.values().all(|n| n.has_heard >= self.sequence)
+    }
+
+    /// Forgets what was said and heard, and keeps where its nodes are and what it believes: a neighbour began anew.
+    pub fn begin_anew(&mut self) {
+        for neighbour in self.neighbours.values_mut() {
+            let boundary = std::mem::take(&mut neighbour.boundary);
+            *neighbour = Neighbour { boundary, ..Neighbour::default() };
+        }
+        self.known.clear();
+        self.said.clear();
+        self.sequence = 0;
+        self.moved.clear();
+        self.momentum = 0.0;
+        (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
+        self.local = None;
+        self.coarse = Coarse::default();
+        (self.descents, self.idle_steps) = (0, 0);
+        self.busy = true;
     }
 
     /// True if there is nothing to do and every neighbour has heard all there is to hear.
@@ -259,6 +314,7 @@ impl BlockAgent {
     /// Descends once if there is news, and says where the boundary is to every neighbour that may not know.
     pub fn step(&mut self) -> Result<Vec<(BlockId, Boundary)>, SolveError> {
         let was_busy = self.busy;
+        self.idle_steps = if was_busy { 0 } else { self.idle_steps.saturating_add(1) };
         if was_busy {
             self.busy = false;
             self.place()?;
@@ -273,7 +329,7 @@ impl BlockAgent {
         self.busy |= self.is_in_doubt();
         self.summarise(was_busy);
         let mut out = Vec::new();
-        let decided = |e: &super::BlockEdge| e.doubted && self.decides(&e.constraint);
+        let decided = |e: &super::BlockEdge| e.trust != Trust::Full && self.decides(&e.constraint);
         let have: Vec<BlockId> = self.coarse.have().collect();
         for (id, neighbour) in &self.neighbours {
             let (towards, summaries) = self.coarse.lacking(neighbour.round, &neighbour.have);
@@ -315,7 +371,9 @@ impl BlockAgent {
         if !due || !self.takes_part() || self.coarse.has(self.block.id) {
             return;
         }
-        let largest = self.doubts().iter().map(|(_, squared)| *squared).fold(0.0, f64::max);
+        // What is decided shapes no one's doubts any more.
+        let undecided = if matches!(self.doubt, Doubt::Decided) { Vec::new() } else { self.doubts() };
+        let largest = undecided.iter().map(|(_, squared)| *squared).fold(0.0, f64::max);
         let summary = Summary::new(&self.block, &self.poses, &self.known, &self.weights, largest);
         if let Some(summary) = summary {
             self.coarse.take(self.coarse.round + 1, &summary);
@@ -324,7 +382,7 @@ impl BlockAgent {
     }
 
     fn is_in_doubt(&self) -> bool {
-        !matches!(self.doubt, Doubt::Decided) && self.block.edges.iter().any(|e| e.doubted)
+        !matches!(self.doubt, Doubt::Decided) && self.block.edges.iter().any(|e| e.trust != Trust::Full)
     }
 
     fn takes_part(&self) -> bool {
@@ -347,9 +405,13 @@ impl BlockAgent {
             *pose = block.map_or_else(Pose::identity, |block| self.coarse.moved(block)) * *pose;
         }
         self.descents = 0;
-        self.momentum = 0.0;
-        self.moved.clear();
-        (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
+        // A move that is no larger than a step leaves the direction of the steps what it was.
+        let (m, rad) = se3::distance(&own, &Pose::identity());
+        if !(m <= self.farthest_m && rad <= self.farthest_rad) {
+            self.momentum = 0.0;
+            self.moved.clear();
+            (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
+        }
         self.busy = true;
         if !matches!(self.doubt, Doubt::Decided) && self.graduate(self.coarse.largest_squared()) {
             self.sequence += 1;
@@ -490,10 +552,17 @@ impl BlockAgent {
         true
     }
 
-    /// The doubted measurements that this block decides on, with their squared errors where both ends are known.
+    /// The doubted measurements that this block decides on, with their squared errors where both ends are known; those
+    /// that something speaks against are asked last.
     fn doubts(&self) -> Vec<(usize, f64)> {
+        let suspended_too = matches!(self.doubt, Doubt::Decided);
+        let doubted = |trust: Trust| match trust {
+            Trust::Full => false,
+            Trust::Doubted => true,
+            Trust::Suspended => suspended_too,
+        };
         let asked =
-            |k: &usize| self.block.edges[*k].doubted && self.decides(&self.block.edges[*k].constraint);
+            |k: &usize| doubted(self.block.edges[*k].trust) && self.decides(&self.block.edges[*k].constraint);
         let edges = (0..self.block.edges.len()).filter(asked);
         edges.filter_map(|k| Some((k, self.squared_error(k)?))).collect()
     }

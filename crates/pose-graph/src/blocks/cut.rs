@@ -1,6 +1,7 @@
 //! Cutting a problem into blocks.
 
 use super::{BlockId, NodeId};
+use crate::gnc::Trust;
 use crate::solver::{Constraint, Problem};
 use std::collections::BTreeMap;
 
@@ -13,8 +14,8 @@ pub struct BlockEdge {
     pub constraint: Constraint,
     /// Its weight at the start, 0 to 1.
     pub weight: f64,
-    /// True if it may be weighted by its residual.
-    pub doubted: bool,
+    /// Whether it may be weighted by its residual, and from when on.
+    pub trust: Trust,
 }
 
 /// What one agent holds.
@@ -61,7 +62,7 @@ pub fn blocks_of(
             index: index as u32,
             constraint: constraint.clone(),
             weight: weights[index],
-            doubted: doubted[index],
+            trust: if doubted[index] { Trust::Doubted } else { Trust::Full },
         };
         if from != to {
             let other = &mut blocks[to as usize];

@@ -8,7 +8,8 @@
 //! * [`cut`]: blocks of a problem.
 //! * [`agent`]: one agent's state machine: messages in, messages out.
 //! * [`coarse`]: whole blocks move, so that what is far apart need not wait for what lies between.
-//! * [`message`]: what they say.
+//! * [`message`]: what they say. [`stillness`]: how they come to know that there is nothing left to say.
+//! * [`own`]: one agent's block of a graph that is known from log entries, with the trust that each loop deserves.
 //! * [`simulation`]: many agents in one process, over a network that loses and delays.
 
 pub mod agent;
@@ -16,12 +17,16 @@ pub mod coarse;
 pub mod cut;
 mod local;
 pub mod message;
+pub mod own;
 pub mod simulation;
+pub mod stillness;
 
 pub use agent::{BlockAgent, BlockSettings};
 pub use cut::{Block, BlockEdge, blocks};
 pub use message::Boundary;
+pub use own::OwnBlock;
 pub use simulation::{Network, Simulation, Traffic};
+pub use stillness::{Standing, Stillness};
 
 /// The number of a block.
 pub type BlockId = u32;
