@@ -40,14 +40,14 @@ async fn two_agents_that_see_the_same_places_end_with_one_map() {
 #[tokio::test(flavor = "multi_thread")]
 async fn services_that_start_anew_are_given_again_what_they_had() {
     let mut cast = Cast::start(&["agent-00"]).await;
-    cast.stream(&[Walk { first_frame: 0, frames: 30 }]).await;
+    cast.stream(&[Walk { first_frame: 0, frames: 60 }]).await;
     cast.drained().await;
     let before = cast.submaps(0).await;
     assert!(before.len() >= 2, "{before:?}");
 
     cast.restart_services().await;
     assert!(cast.solve(0).await.is_err(), "nothing is left");
-    cast.stream(&[Walk { first_frame: 30, frames: 25 }]).await;
+    cast.stream(&[Walk { first_frame: 60, frames: 50 }]).await;
     cast.drained().await;
     let submaps = cast.submaps(0).await;
     assert!(submaps.len() > before.len());

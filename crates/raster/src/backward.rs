@@ -51,7 +51,7 @@ pub struct Gradients {
 /// Derivatives of a loss whose derivatives by pixels are `pixels`, at what `rendering` was rendered from.
 ///
 /// # Panics
-/// If `submaps` and `camera` are not those that `rendering` was made of.
+/// If `submaps` and `camera` are not those that `rendering` was made of, or if it holds no blended colour.
 pub fn backward(
     submaps: &[SubmapView<'_>],
     camera: &Intrinsics,
@@ -59,6 +59,7 @@ pub fn backward(
     rendering: &Rendering,
     pixels: &PixelGradients,
 ) -> Gradients {
+    assert!(!rendering.color.pixels().is_empty(), "a rendering for tracking has no gradients");
     let state = &rendering.state;
     let scratch = || (TileSurfels::default(), TileLoss::empty());
     let sums: Vec<Vec<Run>> = state

@@ -3,10 +3,12 @@
 use super::*;
 
 /// Every image and gradient as one row of numbers each, by name.
-fn numbers(rendering: &Rendering, gradients: &Gradients) -> Vec<(&'static str, Vec<f32>)> {
+fn numbers(rendering: &Rendering, gradients: Option<&Gradients>) -> Vec<(&'static str, Vec<f32>)> {
     let flat = |image: &Image<[f32; 3]>| image.pixels().concat();
     let near = rendering.near_surface.iter().flat_map(|near| near.pixels()).map(|n| *n as u8 as f32);
-    let of = |f: fn(&SurfelGradients) -> Vec<f32>| gradients.submaps.iter().flat_map(f).collect::<Vec<f32>>();
+    let of = |f: fn(&SurfelGradients) -> Vec<f32>| {
+        gradients.iter().flat_map(|g| &g.submaps).flat_map(f).collect::<Vec<f32>>()
+    };
     vec![
         ("colour", flat(&rendering.color)),
         ("depth", rendering.depth_m.pixels().to_vec()),
@@ -22,7 +24,7 @@ fn numbers(rendering: &Rendering, gradients: &Gradients) -> Vec<(&'static str, V
         ("by scale", of(|g| g.scale_m.concat())),
         ("by opacity", of(|g| g.opacity.clone())),
         ("by colour", of(|g| g.color.concat())),
-        ("by pose", gradients.pose.iter().map(|v| *v as f32).collect()),
+        ("by pose", gradients.iter().flat_map(|g| g.pose.iter()).map(|v| *v as f32).collect()),
     ]
 }
 
@@ -42,8 +44,8 @@ fn run(arch: pulp::Arch, outputs: Outputs) -> (u64, Vec<(&'static str, Vec<f32>)
         depth_m: by(0.37),
         opacity: by(0.91),
     };
-    let gradients = backward(&views, &camera, &settings, &rendering, &pixels);
-    (rendering.hits, numbers(&rendering, &gradients))
+    let gradients = outputs.blended().then(|| backward(&views, &camera, &settings, &rendering, &pixels));
+    (rendering.hits, numbers(&rendering, gradients.as_ref()))
 }
 
 #[test]
@@ -103,8 +105,9 @@ fn what_is_not_wanted_is_empty_and_changes_nothing_else() {
             let wanted = match *name {
                 "surface" | "intensity" => outputs.surface(),
                 "median" | "spread" | "normal" => outputs.detail(),
-                "colour" | "depth" => outputs.blended(),
-                _ => true,
+                "opacity" | "near" => true,
+                // Colour, depth and gradients.
+                _ => outputs.blended(),
             };
             assert!(if wanted { a == b } else { b.is_empty() }, "{name} for {outputs:?}");
         }

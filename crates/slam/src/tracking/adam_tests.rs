@@ -1,5 +1,6 @@
 use super::*;
 use crate::mapping::seed::{SeedGrid, SeedSettings, seed};
+use crate::tracking::model::Part;
 use coma_dataset::Sequence;
 use coma_dataset::sequence::rgbd_frame;
 use coma_dataset::world::{World, WorldSettings};
@@ -94,7 +95,7 @@ fn the_derivative_by_the_pose_agrees_with_differences_of_the_definition() {
     // Little is cut off, so that differences meet no cliff; depth weighs enough to be seen.
     let render = RenderSettings { alpha_min: 1e-7, transmittance_min: 0.0, ..Default::default() };
     let settings = AdamSettings { depth_weight: 0.3, min_opacity: 0.6, ..Default::default() };
-    let views = [SubmapView::newPart::new(&cloud, Pose::identity())];
+    let views = [SubmapView::new(&cloud, Pose::identity())];
     let rendering = coma_raster::render_only(&views, &first.camera, &render, None, Outputs::Optimising);
     let loss = pose_loss(&rendering, observed, &settings);
     assert!(loss.mask.pixels().iter().filter(|counts| **counts).count() > 500);
@@ -130,7 +131,7 @@ fn pixels_far_off_or_not_covered_do_not_count() {
     let cloud = surfels(&frame, 1);
     let color = frame.color.to_unit();
     let render = RenderSettings::default();
-    let views = [SubmapView::newPart::new(&cloud, Pose::identity())];
+    let views = [SubmapView::new(&cloud, Pose::identity())];
     let rendering = coma_raster::render_only(&views, &frame.camera, &render, None, Outputs::Optimising);
     let settings = AdamSettings::default();
     let mut depth_m = frame.depth_m.clone();
