@@ -3,11 +3,11 @@
 use crate::node::Node;
 use crate::task::peers::{BUILD, FEATURES};
 use coma_runtime::{Class, Connection};
+use coma_wire::Message;
 use coma_wire::v1::peer_server::Peer;
 use coma_wire::{At, PROTOCOL_MAJOR, PROTOCOL_MINOR, Wire, invalid, v1};
 use futures::Stream;
 use futures::stream;
-use coma_wire::Message;
 use std::pin::Pin;
 use std::sync::Arc;
 use tonic::{Request, Response, Status};
