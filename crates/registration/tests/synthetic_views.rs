@@ -189,6 +189,29 @@ fn equal_surfaces_with_another_pattern_are_a_photometric_mismatch() {
 }
 
 #[test]
+fn a_wrong_focal_length_moves_the_motion_as_far_as_was_foretold_and_too_far_is_refused() {
+    let (a, b) = two_poses();
+    let settings = Settings { focal_uncertainty: 0.01, ..Default::default() };
+    let (mut source, mut target) = (view(&FURNISHED, &a, true), view(&FURNISHED, &b, true));
+    let refined = |source: &View, target: &View| {
+        let prepared = |view: &View| Prepared::new(view, &settings, Side::Source).unwrap();
+        refine(&prepared(source), &prepared(target), &b.inv_mul(&a), &settings).unwrap()
+    };
+    let right = refined(&source, &target);
+    for camera in [&mut source.camera, &mut target.camera] {
+        (camera.fx, camera.fy) = (camera.fx * 1.01, camera.fy * 1.01);
+    }
+    let wrong = refined(&source, &target);
+    let moved_m =
+        (wrong.target_from_source.translation.vector - right.target_from_source.translation.vector).norm();
+    assert!(right.calibration_m > 0.001, "{}", right.calibration_m);
+    assert!((moved_m - right.calibration_m).abs() < 0.5 * right.calibration_m, "{moved_m} {right:?}");
+    let strict = Settings { max_calibration_m: 0.5 * right.calibration_m, ..settings };
+    let outcome = align(&source, &target, &strict, 7);
+    assert!(matches!(outcome, Outcome::Rejected(Reason::PoorlyConstrained { .. })), "{outcome:?}");
+}
+
+#[test]
 fn the_same_bits_come_from_any_number_of_threads() {
     let (a, b) = two_poses();
     let (a, b) = (view(&FURNISHED, &a, true), view(&FURNISHED, &b, true));
