@@ -140,7 +140,7 @@ impl Default for Settings {
             min_fitness: 0.3,
             blocks_across: 40,
             regions_across: 4,
-            regional_scale: 1.35,
+            regional_scale: 1.28,
             floor_m: 0.0001,
             floor_rad: 0.005_f64.to_radians(),
             min_eigenvalue_ratio: 0.004,
