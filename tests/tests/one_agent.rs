@@ -108,8 +108,6 @@ fn wherever_it_jumps_to_it_is_not_sure_of_a_false_pose() {
         match agent.locate(&frame(index)) {
             Located::Lost(_) => lost += 1,
             Located::Tracked(_, found) => {
-                let (metres, radians) =
-                    se3::distance(&found.agent_from_camera, &truth(0).inv_mul(&truth(index)));
                 let off = se3::log(&found.agent_from_camera.inv_mul(&truth(0).inv_mul(&truth(index))));
                 // A view that leaves a direction open is one thing, to be sure of it another.
                 let sigmas_squared = off.dot(&found.covariance.cholesky().unwrap().solve(&off));
