@@ -156,7 +156,7 @@ pub fn solve(
     let in_pattern: Vec<bool> = trust.iter().map(|t| *t != Trust::Suspended).collect();
     let mut solver = Solver::with_pattern(problem, &weights, &in_pattern)?;
     // Rounds on the way need no precision.
-    let rough = SolverSettings { relative_decrease: 1e-3, max_iterations: 10, ..*settings };
+    let rough = SolverSettings { relative_decrease: 1e-2, max_iterations: 10, ..*settings };
     let mut solved = solver.solve(start, &weights, &rough)?;
     // From there on steps start near a minimum: damping would only slow them down along what is known least.
     let settings = &SolverSettings { initial_damping: 1e-4 * settings.initial_damping, ..*settings };

@@ -2,8 +2,7 @@
 //!
 //! The graph of blocks is ordered once (approximate minimum degree), expanded by `B`, and factorised
 //! symbolically once; afterwards values are scattered straight into place. Supernodes are forced: blocks
-//! of six make them pay. Sums have one order: systems below a size are factorised on one thread, and larger ones are
-//! always cut in two in the same way, whether two threads take the halves or one.
+//! of six make them pay. Everything runs on one thread, so sums have one order.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor::{LltError, LltRegularization};
@@ -15,14 +14,6 @@ use faer::sparse::linalg::cholesky::{
 use faer::sparse::{FaerError, SparseColMatRef, SymbolicSparseColMatRef};
 use faer::{Conj, MatMut, Par, Side};
 use nalgebra::SMatrix;
-
-/// Systems of so many blocks are cut for two threads: in smaller ones there is nothing to gain.
-const CUT_FROM_BLOCKS: usize = 8192;
-
-/// How a system is cut. A matter of its size alone, never of the machine: the cut decides the order of sums.
-fn cut(blocks: usize) -> Par {
-    if blocks >= CUT_FROM_BLOCKS { Par::rayon(2) } else { Par::Seq }
-}
 
 /// Why a factorisation failed.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -110,7 +101,7 @@ impl<const B: usize> BlockCholesky<B> {
             .map_err(too_large)?
         };
         let scratch = symbolic
-            .factorize_numeric_llt_scratch::<f64>(cut(blocks), Default::default())
+            .factorize_numeric_llt_scratch::<f64>(Par::Seq, Default::default())
             .or(symbolic.solve_in_place_scratch::<f64>(B, Par::Seq));
         let scratch = MemBuffer::try_new(scratch).map_err(|_| too_large(FaerError::OutOfMemory))?;
         Ok(BlockCholesky {
@@ -200,7 +191,7 @@ impl<const B: usize> BlockCholesky<B> {
             SparseColMatRef::new(pattern, &self.values),
             Side::Lower,
             LltRegularization::default(),
-            cut(self.blocks),
+            Par::Seq,
             MemStack::new(&mut self.scratch),
             Default::default(),
         );
@@ -345,44 +336,6 @@ mod tests {
         let found = DMatrix::from_column_slice(10, 2, &x);
         assert!((found - wanted).norm() < 1e-12);
         assert_eq!(system.diagonal().len(), DVector::<f64>::zeros(10).len());
-    }
-
-    /// A grid of blocks, large enough to be cut, with a factor that has dense parts.
-    fn solution_of_a_large_grid(threads: usize) -> Vec<f64> {
-        let side = 91;
-        let at = |x: usize, y: usize| x * side + y;
-        let mut pairs = Vec::new();
-        for (x, y) in (0..side).flat_map(|x| (0..side).map(move |y| (x, y))) {
-            pairs.extend((x + 1 < side).then(|| (at(x, y), at(x + 1, y))));
-            pairs.extend((y + 1 < side).then(|| (at(x, y), at(x, y + 1))));
-        }
-        let blocks = side * side;
-        assert!(blocks >= CUT_FROM_BLOCKS);
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| {
-            let mut system = BlockCholesky::<6>::new(blocks, &pairs).unwrap();
-            for k in 0..blocks {
-                let value = SMatrix::<f64, 6, 6>::identity() * (5.0 + (k as f64).sin());
-                system.add(system.slot(k, k).unwrap(), &value);
-            }
-            for (n, &(a, b)) in pairs.iter().enumerate() {
-                let value = SMatrix::<f64, 6, 6>::from_fn(|r, c| 0.1 * ((n + 7 * r + 3 * c) as f64).cos());
-                system.add(system.slot(a, b).unwrap(), &value);
-            }
-            system.factorise().unwrap();
-            let mut x: Vec<f64> = (0..6 * blocks).map(|k| (k as f64).cos()).collect();
-            system.solve_in_place(&mut x, 1);
-            x
-        })
-    }
-
-    #[test]
-    fn a_large_system_has_the_same_bits_whatever_the_number_of_threads() {
-        let bits = |x: Vec<f64>| x.into_iter().map(f64::to_bits).collect::<Vec<_>>();
-        let one = bits(solution_of_a_large_grid(1));
-        for threads in [2, 3, 8] {
-            assert!(bits(solution_of_a_large_grid(threads)) == one, "{threads} threads");
-        }
     }
 
     #[test]

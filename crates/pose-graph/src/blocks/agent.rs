@@ -405,13 +405,9 @@ impl BlockAgent {
             *pose = block.map_or_else(Pose::identity, |block| self.coarse.moved(block)) * *pose;
         }
         self.descents = 0;
-        // A move that is no larger than a step leaves the direction of the steps what it was.
-        let (m, rad) = se3::distance(&own, &Pose::identity());
-        if !(m <= self.farthest_m && rad <= self.farthest_rad) {
-            self.momentum = 0.0;
-            self.moved.clear();
-            (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
-        }
+        self.momentum = 0.0;
+        self.moved.clear();
+        (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
         self.busy = true;
         if !matches!(self.doubt, Doubt::Decided) && self.graduate(self.coarse.largest_squared()) {
             self.sequence += 1;
