@@ -159,12 +159,6 @@ fn a_camera_that_stands_still_for_500_frames_makes_no_new_submap() {
 }
 
 #[test]
-#[ignore = "takes minutes"]
-fn nor_does_one_that_stands_still_for_10000() {
-    stand_still(10_000, 160);
-}
-
-#[test]
 fn poses_and_maps_are_the_same_bits_with_one_thread_and_two() {
     let frames = frames(45, 160, Some(SensorNoise::default()));
     let on = |threads| {
