@@ -90,10 +90,16 @@ impl<T> std::ops::IndexMut<(usize, usize)> for Image<T> {
     }
 }
 
+/// Intensity of a colour (ITU-R BT.601), in the colour's own scale.
+#[inline]
+pub fn luminance(color: [f32; 3]) -> f32 {
+    0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]
+}
+
 impl Image<[u8; 3]> {
     /// Luminance in 0..1 (Rec. 601 weights).
     pub fn luminance(&self) -> Image<f32> {
-        self.map(|c| (0.299 * c[0] as f32 + 0.587 * c[1] as f32 + 0.114 * c[2] as f32) / 255.0)
+        self.map(|c| luminance(c.map(f32::from)) / 255.0)
     }
 
     /// Colour in 0..1.

@@ -7,6 +7,6 @@ pub mod normals;
 pub mod pyramid;
 pub mod rgbd;
 
-pub use image::Image;
+pub use image::{Image, luminance};
 pub use noise::DepthNoise;
 pub use rgbd::{FrameError, RgbdFrame};

@@ -8,7 +8,7 @@
 
 use crate::descriptor::Space;
 use crate::encoder::{EncodeError, Encoder, Thresholds};
-use coma_frame::Image;
+use coma_frame::{Image, luminance};
 
 const CELLS_X: usize = 4;
 const CELLS_Y: usize = 3;
@@ -114,7 +114,7 @@ fn split(position: f32) -> [(isize, f32); 2] {
 
 fn structure(image: &Image<[f32; 3]>) -> Vec<f32> {
     let (width, height) = (image.width(), image.height());
-    let log = image.map(|c| (0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2] + LOG_OFFSET).ln());
+    let log = image.map(|c| (luminance(*c) + LOG_OFFSET).ln());
     let mut bins = vec![0.0f32; STRUCTURE];
     for y in 1..height - 1 {
         for x in 1..width - 1 {

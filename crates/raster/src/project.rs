@@ -3,6 +3,7 @@
 use crate::reach::Reach;
 use crate::{RenderSettings, SubmapView};
 use bytemuck::Zeroable;
+use coma_frame::luminance;
 use coma_geometry::Intrinsics;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use rayon::prelude::*;
@@ -122,7 +123,7 @@ fn project_one(
 ) -> Option<(Projected, Reach)> {
     let (opacity, color) = (view.surfels.opacity[index], view.surfels.color[index]);
     let given = view.intensity.and_then(|all| all.get(index)).copied();
-    let intensity = given.unwrap_or(0.299 * color[0] + 0.587 * color[1] + 0.114 * color[2]);
+    let intensity = given.unwrap_or_else(|| luminance(color));
     let s = InCamera::of(view, pose, index);
     let z = s.center.z;
     let geometry = s.center.iter().chain(s.axes.iter()).chain(&s.scale);

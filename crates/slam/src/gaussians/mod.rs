@@ -14,7 +14,7 @@ use crate::mapping::submap::corrected_color;
 use crate::tracking::align::{Brightness, align};
 use crate::tracking::view::TrackingView;
 use crate::tracking::{self, Tracked};
-use coma_frame::RgbdFrame;
+use coma_frame::{RgbdFrame, luminance};
 use coma_geometry::{Pose, se3};
 use coma_raster::GrowthTest;
 use coma_raster::ewa::{self, Gaussian, GaussianCloud, GaussianView};
@@ -131,7 +131,7 @@ impl GaussianAgent {
                 *z = 0.0;
             }
         }
-        let intensity = picture.color.map(|c| 0.299 * c[0] + 0.587 * c[1] + 0.114 * c[2]);
+        let intensity = picture.color.map(|c| luminance(*c));
         let model = TrackingView::build(frame.camera, depth_m, intensity, view.noise, view.levels.len());
         let (model, view) = (model.coarser(settings.finest_level), view.coarser(settings.finest_level));
         let found = align(&model, &view, &Pose::identity(), self.brightness, &settings.frame_to_model)?;

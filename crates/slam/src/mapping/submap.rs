@@ -7,7 +7,7 @@ use super::optimise::{Adam, Loss, OptimiseSettings, Target, optimise_once};
 use super::seed::{SeedGrid, SeedSettings, seed};
 use crate::tracking::align::Brightness;
 use crate::tracking::view::TrackingView;
-use coma_frame::{Image, RgbdFrame};
+use coma_frame::{Image, RgbdFrame, luminance};
 use coma_geometry::{Pose, SubmapId, se3};
 use coma_raster::{GrowthTest, Outputs, RenderSettings, SubmapView};
 use coma_surfel::SurfelCloud;
@@ -198,8 +198,7 @@ impl ActiveSubmap {
         for surfel in new_surfels {
             let depth_m = (camera_from_submap * Point3::from(surfel.center_m).cast::<f64>()).z as f32;
             let sigma = frame.noise.sigma_m(depth_m);
-            let [r, g, b] = surfel.color;
-            self.measured.push(sigma * sigma, 0.299 * r + 0.587 * g + 0.114 * b);
+            self.measured.push(sigma * sigma, luminance(surfel.color));
             self.surfels.push(surfel);
         }
         self.adam.resize(self.surfels.len());
