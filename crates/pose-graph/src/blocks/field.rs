@@ -1,0 +1,347 @@
+//! Smooth motions of all blocks together: the slow part of a block-by-block solve in few numbers.
+//!
+//! What descent block by block is slow at is smooth in space: the whole map bends, or one side of it shifts against the
+//! other. So the points of a coarse grid over the map get a motion each, six numbers, and every node moves as the points
+//! around it say. How a node's displacement follows from the turns of the points around it (half the lever arm, as
+//! linked interpolation of plates has it) keeps what bends evenly free of shear.
+//!
+//! Each block says what its measurements are worth for these motions ([`Part`]); parts add up, and the sum over all
+//! blocks gives the [`Field`] that lowers the cost most.
+
+use super::{Block, BlockId, NodeId};
+use crate::residual::linearise;
+use crate::sparse::BlockCholesky;
+use coma_geometry::{Matrix6, Pose, Tangent};
+use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
+use std::collections::BTreeMap;
+
+/// The largest turn of a point in one round, radians: what is linearised holds no farther.
+const MOST_RAD: f64 = 0.3;
+/// Largest magnitude of a number that is believed.
+const MOST: f64 = 1e30;
+/// Most points of a grid.
+const MOST_POINTS: usize = 4096;
+/// So many nodes for each point of a grid, at least.
+const NODES_PER_POINT: usize = 8;
+/// How much stiffer than their measurements nodes are that are held.
+const HOLD: f64 = 100.0;
+/// Damping as a share of the diagonal: parts are summed in single precision.
+const DAMPING: f64 = 1e-6;
+
+/// Points in a regular grid, in the map's frame; along an axis that the map hardly extends in there is one layer.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Grid {
+    /// Its first point, metres.
+    pub origin: Vector3<f64>,
+    /// Between two points, metres.
+    pub spacing_m: f64,
+    /// Along each axis; x varies fastest.
+    pub points: [u32; 3],
+}
+
+impl Grid {
+    /// The finest grid of at most so many points over a box.
+    fn over(low: &Vector3<f64>, high: &Vector3<f64>, most: usize) -> Self {
+        let extent = high - low;
+        let points = |spacing_m: f64| {
+            [0, 1, 2].map(|axis| match extent[axis] / spacing_m {
+                steps if steps > 0.5 => steps.ceil().min(MOST_POINTS as f64) as u32 + 1,
+                _ => 1,
+            })
+        };
+        let count = |spacing_m: f64| points(spacing_m).iter().map(|n| *n as usize).product::<usize>();
+        let mut spacing_m = 2.0 * extent.max();
+        if !(spacing_m > 0.0 && spacing_m <= MOST) {
+            return Grid::default();
+        }
+        while count(0.9 * spacing_m) <= most.min(MOST_POINTS) {
+            spacing_m *= 0.9;
+        }
+        let points = points(spacing_m);
+        let half = Vector3::from_fn(|axis, _| 0.5 * spacing_m * f64::from(points[axis] - 1));
+        Grid { origin: (low + high) * 0.5 - half, spacing_m, points }
+    }
+
+    /// How many points.
+    pub fn len(&self) -> usize {
+        self.points.iter().map(|n| *n as usize).product()
+    }
+
+    /// True of a grid without points, which moves nothing.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// True if it can be computed with.
+    pub fn is_sound(&self) -> bool {
+        let few = self.points.iter().try_fold(1_u64, |all, n| all.checked_mul(u64::from(*n)));
+        let placed = self.origin.iter().all(|x| x.abs() <= MOST);
+        few.is_some_and(|n| n <= MOST_POINTS as u64)
+            && (self.is_empty() || placed && self.spacing_m > 0.0 && self.spacing_m <= MOST)
+    }
+
+    /// The points around a place, and the motion there (displacement, turn; in the map's frame) for each one's.
+    fn around(&self, place: &Vector3<f64>) -> Vec<(u32, Matrix6)> {
+        if self.is_empty() {
+            return Vec::new();
+        }
+        let mut around = vec![(0, 1.0, Vector3::zeros())];
+        for axis in [2, 1, 0] {
+            let count = self.points[axis];
+            let along = place[axis] - self.origin[axis];
+            // A flat grid turns as a plate; within a cell half the arm belongs to each side.
+            let arm = if count == 1 { 1.0 } else { 0.5 };
+            let first = ((along / self.spacing_m).max(0.0) as u32).min(count.saturating_sub(2));
+            let share = (along / self.spacing_m - f64::from(first)).clamp(-0.5, 1.5);
+            let sides: &[(u32, f64)] = if count == 1 { &[(0, 1.0)] } else { &[(0, 1.0 - share), (1, share)] };
+            let split = |(index, weight, lever): (u32, f64, Vector3<f64>)| {
+                sides.iter().map(move |(side, part)| {
+                    let mut lever = lever;
+                    lever[axis] = arm * (along - self.spacing_m * f64::from(first + side));
+                    (index * count + first + side, weight * part, lever)
+                })
+            };
+            around = around.into_iter().flat_map(split).collect();
+        }
+        let motion = |(index, weight, lever): (u32, f64, Vector3<f64>)| {
+            let mut motion = Matrix6::identity();
+            // turn x lever
+            motion.fixed_view_mut::<3, 3>(0, 3).copy_from(&-lever.cross_matrix());
+            (index, motion * weight)
+        };
+        around.into_iter().map(motion).collect()
+    }
+
+    /// Where a pose is moved to when the grid's points move so.
+    pub(super) fn moved(&self, motions: &[Tangent], map_from_node: &Pose) -> Pose {
+        let mut motion = Tangent::zeros();
+        for (point, here) in self.around(&map_from_node.translation.vector) {
+            motion += motions.get(point as usize).map_or_else(Tangent::zeros, |m| here * m);
+        }
+        let mut moved = *map_from_node;
+        moved.translation.vector += motion.fixed_rows::<3>(0);
+        moved.rotation = UnitQuaternion::from_scaled_axis(motion.fixed_rows::<3>(3)) * moved.rotation;
+        moved.rotation.renormalize();
+        moved
+    }
+}
+
+/// What a block sees: poses in the map's frame, and one weight per measurement.
+pub(super) struct Sight<'a> {
+    pub own: &'a BTreeMap<NodeId, Pose>,
+    pub known: &'a BTreeMap<NodeId, Pose>,
+    pub weights: &'a [f64],
+}
+
+impl Sight<'_> {
+    fn pose(&self, node: NodeId) -> Option<&Pose> {
+        self.own.get(&node).or_else(|| self.known.get(&node))
+    }
+}
+
+/// What the measurements of some blocks are worth for the motions of a grid's points:
+/// `gradient . m + m . hessian m / 2`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Part {
+    /// Whose, ascending.
+    pub blocks: Vec<BlockId>,
+    /// Others that these have measurements to, ascending: the whole is known when there are none.
+    pub open: Vec<BlockId>,
+    /// Of these blocks.
+    pub nodes: u32,
+    /// The box that holds them, metres in the map's frame.
+    pub low: Vector3<f64>,
+    /// Its other corner.
+    pub high: Vector3<f64>,
+    /// Largest squared error of a doubted measurement that they decide on.
+    pub largest_squared: f64,
+    /// By point.
+    pub gradient: BTreeMap<u32, Tangent>,
+    /// By two points, the smaller one first.
+    pub hessian: BTreeMap<(u32, u32), SMatrix<f32, 6, 6>>,
+}
+
+impl Part {
+    /// A block's own. `None` while some of its nodes or its neighbours' have not found their place.
+    pub(super) fn new(block: &Block, sight: &Sight<'_>, grid: &Grid, largest_squared: f64) -> Option<Self> {
+        let mut part = Part {
+            blocks: vec![block.id],
+            open: block.neighbours.values().copied().collect(),
+            nodes: block.nodes.len() as u32,
+            low: Vector3::repeat(MOST),
+            high: Vector3::repeat(-MOST),
+            largest_squared,
+            gradient: BTreeMap::new(),
+            hessian: BTreeMap::new(),
+        };
+        part.open.sort_unstable();
+        part.open.dedup();
+        for node in &block.nodes {
+            let place = sight.pose(*node)?.translation.vector;
+            (part.low, part.high) = (part.low.inf(&place), part.high.sup(&place));
+        }
+        // How a node moves, in its own frame, with each point around it.
+        let mut around: BTreeMap<NodeId, Vec<(u32, Matrix6)>> = BTreeMap::new();
+        let mut hessian: BTreeMap<(u32, u32), Matrix6> = BTreeMap::new();
+        for (edge, weight) in block.edges.iter().zip(sight.weights) {
+            let c = &edge.constraint;
+            let ends = [c.from as NodeId, c.to as NodeId];
+            let (from_pose, to_pose) = (sight.pose(ends[0])?, sight.pose(ends[1])?);
+            let at = linearise(from_pose, to_pose, &c.from_from_to);
+            let information = c.information * *weight;
+            for (node, pose) in ends.iter().zip([from_pose, to_pose]) {
+                around.entry(*node).or_insert_with(|| {
+                    let turned = into_frame_of(pose);
+                    let points = grid.around(&pose.translation.vector).into_iter();
+                    points.map(|(point, motion)| (point, turned * motion)).collect()
+                });
+            }
+            let ends = [(ends[0], at.wrt_i), (ends[1], at.wrt_j)];
+            for held in ends.iter().filter(|(node, _)| block.fixed.contains(node)) {
+                add(&mut hessian, &towards(std::slice::from_ref(held), &around), &(information * HOLD));
+            }
+            let mine = ends.iter().find_map(|(node, _)| block.neighbours.get(node)).is_none_or(|b| block.id < *b);
+            if mine && *weight > 0.0 {
+                let towards = towards(&ends, &around);
+                for (point, wrt_point) in &towards {
+                    *part.gradient.entry(*point).or_insert_with(Tangent::zeros) +=
+                        wrt_point.transpose() * (information * at.error);
+                }
+                add(&mut hessian, &towards, &information);
+            }
+        }
+        part.hessian = hessian.into_iter().map(|(points, block)| (points, block.map(|x| x as f32))).collect();
+        Some(part)
+    }
+
+    /// The sum with others'. `None` if one block is in two of them.
+    pub(super) fn sum<'a>(&self, others: impl Iterator<Item = &'a Part>) -> Option<Part> {
+        let mut sum = self.clone();
+        for other in others {
+            sum.blocks.extend(&other.blocks);
+            sum.open.extend(&other.open);
+            sum.nodes = sum.nodes.saturating_add(other.nodes);
+            (sum.low, sum.high) = (sum.low.inf(&other.low), sum.high.sup(&other.high));
+            sum.largest_squared = sum.largest_squared.max(other.largest_squared);
+            for (point, gradient) in &other.gradient {
+                *sum.gradient.entry(*point).or_insert_with(Tangent::zeros) += gradient;
+            }
+            for (points, block) in &other.hessian {
+                *sum.hessian.entry(*points).or_insert_with(SMatrix::zeros) += block;
+            }
+        }
+        sum.blocks.sort_unstable();
+        let distinct = sum.blocks.windows(2).all(|pair| pair[0] < pair[1]);
+        sum.open.sort_unstable();
+        sum.open.dedup();
+        sum.open.retain(|block| sum.blocks.binary_search(block).is_err());
+        distinct.then_some(sum)
+    }
+
+    /// How the points of the grid move that this sum over all blocks speaks of, and the next grid. None moves where that
+    /// has no answer.
+    pub(super) fn field(&self, grid: &Grid, most_points: usize) -> Field {
+        let mut motions = vec![Tangent::zeros(); grid.len()];
+        for (point, motion) in self.minimum().unwrap_or_default() {
+            if let Some(slot) = motions.get_mut(point as usize) {
+                *slot = motion;
+            }
+        }
+        let farthest = motions.iter().map(|m| m.fixed_rows::<3>(3).norm()).fold(0.0, f64::max);
+        if farthest > MOST_RAD {
+            motions.iter_mut().for_each(|m| *m *= MOST_RAD / farthest);
+        }
+        let most = most_points.min(self.nodes as usize / NODES_PER_POINT);
+        Field { motions, largest_squared: self.largest_squared, next: Grid::over(&self.low, &self.high, most) }
+    }
+
+    fn minimum(&self) -> Option<Vec<(u32, Tangent)>> {
+        let points: Vec<u32> = self.hessian.keys().filter(|(a, b)| a == b).map(|(a, _)| *a).collect();
+        let index = |point: &u32| points.binary_search(point).ok();
+        let pairs: Vec<(usize, usize)> =
+            self.hessian.keys().filter_map(|(a, b)| index(a).zip(index(b))).collect();
+        let mut system = BlockCholesky::<6>::new(points.len(), &pairs).ok()?;
+        for ((a, b), block) in &self.hessian {
+            system.add(system.slot(index(a)?, index(b)?)?, &block.map(f64::from));
+        }
+        let damping: Vec<f64> = system.diagonal().iter().map(|d| DAMPING * d).collect();
+        system.add_to_diagonal(&damping);
+        system.factorise().ok()?;
+        let of_point = |point| self.gradient.get(point).map_or_else(Tangent::zeros, |g| -g);
+        let mut rhs: Vec<f64> = points.iter().flat_map(|p| of_point(p).iter().copied().collect::<Vec<_>>()).collect();
+        system.solve_in_place(&mut rhs, 1);
+        let found = points.into_iter().zip(rhs.chunks_exact(6).map(Tangent::from_column_slice));
+        rhs.iter().all(|x| x.is_finite()).then(|| found.collect())
+    }
+
+    /// Size as plain numbers: 4 bytes a block, a point and each of a hessian's 36 numbers, 8 for all others.
+    pub fn bytes(&self) -> usize {
+        let lists = 4 + 4 * self.blocks.len() + 4 + 4 * self.open.len() + 4 + self.gradient.len() * (4 + 6 * 8);
+        lists + 4 + 6 * 8 + 8 + 4 + self.hessian.len() * (2 * 4 + 36 * 4)
+    }
+
+    pub(super) fn is_sound(&self) -> bool {
+        let finite = |x: &f64| x.abs() <= MOST;
+        let single = |x: &f32| f64::from(x.abs()) <= MOST;
+        finite(&self.largest_squared)
+            && self.low.iter().chain(&self.high).all(finite)
+            && self.gradient.values().all(|g| g.iter().all(finite))
+            && self.hessian.values().all(|h| h.iter().all(single))
+    }
+}
+
+/// How all move in one round.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Field {
+    /// Of each point of the round's grid: displacement in metres and turn in radians, in the map's frame.
+    pub motions: Vec<Tangent>,
+    /// Largest squared error of a doubted measurement, of all blocks, before the round.
+    pub largest_squared: f64,
+    /// The grid of the next round.
+    pub next: Grid,
+}
+
+impl Field {
+    /// Size as plain numbers.
+    pub fn bytes(&self) -> usize {
+        4 + self.motions.len() * 6 * 8 + 8 + 4 * 8 + 3 * 4
+    }
+
+    pub(super) fn is_sound(&self, grid: &Grid) -> bool {
+        self.motions.len() == grid.len()
+            && self.motions.iter().all(|m| m.iter().all(|x| x.abs() <= MOST))
+            && self.next.is_sound()
+    }
+}
+
+/// Turns a displacement and a turn in the map's frame into a node's.
+fn into_frame_of(map_from_node: &Pose) -> Matrix6 {
+    let node_from_map: Matrix3<f64> = map_from_node.rotation.inverse().to_rotation_matrix().into_inner();
+    let mut turned = Matrix6::zeros();
+    turned.fixed_view_mut::<3, 3>(0, 0).copy_from(&node_from_map);
+    turned.fixed_view_mut::<3, 3>(3, 3).copy_from(&node_from_map);
+    turned
+}
+
+/// How an error changes with the points' motions, from how it changes with its nodes'.
+fn towards(
+    ends: &[(NodeId, Matrix6)],
+    around: &BTreeMap<NodeId, Vec<(u32, Matrix6)>>,
+) -> BTreeMap<u32, Matrix6> {
+    let mut out = BTreeMap::new();
+    for (node, wrt_node) in ends {
+        for (point, motion) in around.get(node).into_iter().flatten() {
+            *out.entry(*point).or_insert_with(Matrix6::zeros) += wrt_node * motion;
+        }
+    }
+    out
+}
+
+fn add(hessian: &mut BTreeMap<(u32, u32), Matrix6>, towards: &BTreeMap<u32, Matrix6>, information: &Matrix6) {
+    for (a, wrt_a) in towards {
+        let weighted = wrt_a.transpose() * information;
+        for (b, wrt_b) in towards.range(a..) {
+            *hessian.entry((*a, *b)).or_insert_with(Matrix6::zeros) += weighted * wrt_b;
+        }
+    }
+}
