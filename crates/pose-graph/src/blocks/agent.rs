@@ -149,7 +149,7 @@ impl BlockAgent {
         }
         let coarse = Coarse::new(block.id, neighbours.keys().copied(), settings.coarse_points);
         BlockAgent {
-            poses: block.fixed.iter().map(|node| (*node, start(*node))).collect(),
+            poses: block.fixed.iter().filter(|n| block.owns(n)).map(|node| (*node, start(*node))).collect(),
             weights: block.edges.iter().map(|e| e.weight).collect(),
             changes_of_weight: vec![0; block.edges.len()],
             doubt: Doubt::NotYet,
@@ -291,7 +291,7 @@ impl BlockAgent {
                 && (pose.rotation.quaternion().norm() - 1.0).abs() < 1e-6;
             if sound && self.block.neighbours.get(node) == Some(&message.from) {
                 self.busy = true;
-                let pose = if behind { self.coarse.moved(pose) } else { *pose };
+                let pose = if behind && !self.block.fixed.contains(node) { self.coarse.moved(pose) } else { *pose };
                 if self.known.insert(*node, pose).is_none() {
                     self.local = None;
                 }
@@ -389,12 +389,11 @@ impl BlockAgent {
 
     /// Moves as the newest round has all move.
     fn follow(&mut self) {
-        for (node, pose) in &mut self.poses {
+        for (node, pose) in self.poses.iter_mut().chain(&mut self.said).chain(&mut self.known) {
             if !self.block.fixed.contains(node) {
                 *pose = self.coarse.moved(pose);
             }
         }
-        self.said.values_mut().chain(self.known.values_mut()).for_each(|pose| *pose = self.coarse.moved(pose));
         self.descents = 0;
         (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
         self.busy = true;

@@ -23,8 +23,6 @@ const MOST: f64 = 1e30;
 const MOST_POINTS: usize = 4096;
 /// So many nodes for each point of a grid, at least.
 const NODES_PER_POINT: usize = 8;
-/// How much stiffer than their measurements nodes are that are held.
-const HOLD: f64 = 100.0;
 /// Damping as a share of the diagonal: parts are summed in single precision.
 const DAMPING: f64 = 1e-6;
 
@@ -45,7 +43,7 @@ impl Grid {
         let extent = high - low;
         let points = |spacing_m: f64| {
             [0, 1, 2].map(|axis| match extent[axis] / spacing_m {
-                steps if steps > 0.5 => steps.ceil().min(MOST_POINTS as f64) as u32 + 1,
+                steps if steps >= 1.0 => steps.round().min(MOST_POINTS as f64) as u32 + 1,
                 _ => 1,
             })
         };
@@ -191,15 +189,15 @@ impl Part {
             let information = c.information * *weight;
             for (node, pose) in ends.iter().zip([from_pose, to_pose]) {
                 around.entry(*node).or_insert_with(|| {
+                    if block.fixed.contains(node) {
+                        return Vec::new();
+                    }
                     let turned = into_frame_of(pose);
                     let points = grid.around(&pose.translation.vector).into_iter();
                     points.map(|(point, motion)| (point, turned * motion)).collect()
                 });
             }
             let ends = [(ends[0], at.wrt_i), (ends[1], at.wrt_j)];
-            for held in ends.iter().filter(|(node, _)| block.fixed.contains(node)) {
-                add(&mut hessian, &towards(std::slice::from_ref(held), &around), &(information * HOLD));
-            }
             let mine = ends.iter().find_map(|(node, _)| block.neighbours.get(node)).is_none_or(|b| block.id < *b);
             if mine && *weight > 0.0 {
                 let towards = towards(&ends, &around);

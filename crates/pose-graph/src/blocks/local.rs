@@ -25,7 +25,7 @@ impl Local {
         weights: &[f64],
     ) -> Result<Option<Self>, SolveError> {
         let ends = |c: &Constraint| [c.from as NodeId, c.to as NodeId];
-        let own = |node: &NodeId| !block.neighbours.contains_key(node);
+        let own = |node: &NodeId| block.owns(node);
         let mut neighbours: BTreeMap<NodeId, Vec<NodeId>> = BTreeMap::new();
         for (edge, _) in block.edges.iter().zip(weights).filter(|(_, w)| **w > 0.0) {
             let [from, to] = ends(&edge.constraint);
@@ -33,7 +33,7 @@ impl Local {
             neighbours.entry(to).or_default().push(from);
         }
         let mut reached: BTreeMap<NodeId, bool> = known.keys().map(|node| (*node, false)).collect();
-        reached.extend(block.fixed.iter().map(|node| (*node, false)));
+        reached.extend(block.fixed.iter().filter(|n| own(n)).map(|node| (*node, false)));
         let mut open: Vec<NodeId> = reached.keys().copied().collect();
         while let Some(node) = open.pop() {
             for next in neighbours.get(&node).into_iter().flatten().filter(|n| own(n)) {
