@@ -147,7 +147,11 @@ impl Coarse {
             self.sum = None;
         }
         match &news.field {
-            Some(field) if news.round == self.round + 1 && field.is_sound(&self.grid) => {
+            Some(field)
+                if news.round == self.round + 1
+                    && field.motions.len() == self.grid.len()
+                    && field.is_sound() =>
+            {
                 self.follow(field.clone());
                 true
             }

@@ -20,11 +20,14 @@ const MOST_RAD: f64 = 0.3;
 /// Largest magnitude of a number that is believed.
 const MOST: f64 = 1e30;
 /// Most points of a grid.
-const MOST_POINTS: usize = 4096;
+pub const MOST_POINTS: usize = 4096;
 /// So many nodes for each point of a grid, at least.
 const NODES_PER_POINT: usize = 8;
 /// Damping as a share of the diagonal: parts are summed in single precision.
 const DAMPING: f64 = 1e-6;
+/// How stiffly points that are side by side hang together, as a share of the mean diagonal: one with hardly a node around
+/// it goes along.
+const STIFFNESS: f64 = 1e-3;
 
 /// Points in a regular grid, in the map's frame; along an axis that the map hardly extends in there is one layer.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -108,6 +111,17 @@ impl Grid {
             (index, motion * weight)
         };
         around.into_iter().map(motion).collect()
+    }
+
+    /// The points that come next along each axis, and the way there.
+    fn next_to(&self, point: u32) -> impl Iterator<Item = (u32, Vector3<f64>)> + '_ {
+        let strides = [1, self.points[0], self.points[0] * self.points[1]];
+        (0..3).filter_map(move |axis| {
+            let along = point / strides[axis] % self.points[axis].max(1);
+            let mut way = Vector3::zeros();
+            way[axis] = self.spacing_m;
+            (along + 1 < self.points[axis]).then_some((point + strides[axis], way))
+        })
     }
 
     /// Where a pose is moved to when the grid's points move so.
@@ -240,7 +254,7 @@ impl Part {
     /// has no answer.
     pub(super) fn field(&self, grid: &Grid, most_points: usize) -> Field {
         let mut motions = vec![Tangent::zeros(); grid.len()];
-        for (point, motion) in self.minimum().unwrap_or_default() {
+        for (point, motion) in self.minimum(grid).unwrap_or_default() {
             if let Some(slot) = motions.get_mut(point as usize) {
                 *slot = motion;
             }
@@ -253,20 +267,42 @@ impl Part {
         Field { motions, largest_squared: self.largest_squared, next: Grid::over(&self.low, &self.high, most) }
     }
 
-    fn minimum(&self) -> Option<Vec<(u32, Tangent)>> {
+    fn minimum(&self, grid: &Grid) -> Option<Vec<(u32, Tangent)>> {
         let points: Vec<u32> = self.hessian.keys().filter(|(a, b)| a == b).map(|(a, _)| *a).collect();
         let index = |point: &u32| points.binary_search(point).ok();
-        let pairs: Vec<(usize, usize)> =
-            self.hessian.keys().filter_map(|(a, b)| index(a).zip(index(b))).collect();
+        let adjacent: Vec<(usize, usize, Vector3<f64>)> = points
+            .iter()
+            .flat_map(|point| grid.next_to(*point).map(move |(next, way)| (*point, next, way)))
+            .filter_map(|(a, b, way)| Some((index(&a)?, index(&b)?, way)))
+            .collect();
+        let measured = self.hessian.keys().filter_map(|(a, b)| index(a).zip(index(b)));
+        let pairs: Vec<(usize, usize)> = measured.chain(adjacent.iter().map(|(a, b, _)| (*a, *b))).collect();
         let mut system = BlockCholesky::<6>::new(points.len(), &pairs).ok()?;
         for ((a, b), block) in &self.hessian {
             system.add(system.slot(index(a)?, index(b)?)?, &block.map(f64::from));
         }
-        let damping: Vec<f64> = system.diagonal().iter().map(|d| DAMPING * d).collect();
+        let diagonal = system.diagonal();
+        let mean = |first: usize| {
+            let of_point = |point: &[f64]| point[first] + point[first + 1] + point[first + 2];
+            diagonal.chunks_exact(6).map(of_point).sum::<f64>() / (3 * points.len()) as f64
+        };
+        let (shift, turn) = (STIFFNESS * mean(0), STIFFNESS * mean(3));
+        let stiffness = Matrix6::from_diagonal(&Tangent::new(shift, shift, shift, turn, turn, turn));
+        for (a, b, way) in adjacent {
+            // As one rigid body: what is at b follows from a's motion.
+            let mut carried = Matrix6::identity();
+            carried.fixed_view_mut::<3, 3>(0, 3).copy_from(&-way.cross_matrix());
+            system.add(system.slot(a, a)?, &(carried.transpose() * stiffness * carried));
+            system.add(system.slot(a, b)?, &-(carried.transpose() * stiffness));
+            system.add(system.slot(b, b)?, &stiffness);
+        }
+        let damping: Vec<f64> = diagonal.iter().map(|d| DAMPING * d).collect();
         system.add_to_diagonal(&damping);
         system.factorise().ok()?;
-        let of_point = |point| self.gradient.get(point).map_or_else(Tangent::zeros, |g| -g);
-        let mut rhs: Vec<f64> = points.iter().flat_map(|p| of_point(p).iter().copied().collect::<Vec<_>>()).collect();
+        let mut rhs = vec![0.0; 6 * points.len()];
+        for (k, gradient) in self.gradient.iter().filter_map(|(point, g)| Some((index(point)?, g))) {
+            rhs[6 * k..][..6].copy_from_slice((-gradient).as_slice());
+        }
         system.solve_in_place(&mut rhs, 1);
         let found = points.into_iter().zip(rhs.chunks_exact(6).map(Tangent::from_column_slice));
         rhs.iter().all(|x| x.is_finite()).then(|| found.collect())
@@ -278,13 +314,14 @@ impl Part {
         lists + 4 + 6 * 8 + 8 + 4 + self.hessian.len() * (2 * 4 + 36 * 4)
     }
 
-    pub(super) fn is_sound(&self) -> bool {
+    /// True if it can be computed with.
+    pub fn is_sound(&self) -> bool {
         let finite = |x: &f64| x.abs() <= MOST;
         let single = |x: &f32| f64::from(x.abs()) <= MOST;
         finite(&self.largest_squared)
             && self.low.iter().chain(&self.high).all(finite)
             && self.gradient.values().all(|g| g.iter().all(finite))
-            && self.hessian.values().all(|h| h.iter().all(single))
+            && self.hessian.iter().all(|((a, b), h)| a <= b && h.iter().all(single))
     }
 }
 
@@ -305,9 +342,11 @@ impl Field {
         4 + self.motions.len() * 6 * 8 + 8 + 4 * 8 + 3 * 4
     }
 
-    pub(super) fn is_sound(&self, grid: &Grid) -> bool {
-        self.motions.len() == grid.len()
-            && self.motions.iter().all(|m| m.iter().all(|x| x.abs() <= MOST))
+    /// True if it can be computed with.
+    pub fn is_sound(&self) -> bool {
+        let finite = |x: &f64| x.abs() <= MOST;
+        finite(&self.largest_squared)
+            && self.motions.iter().all(|m| m.iter().all(finite))
             && self.next.is_sound()
     }
 }
