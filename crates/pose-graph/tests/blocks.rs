@@ -3,6 +3,8 @@
 mod world;
 
 use coma_geometry::{Pose, Tangent, se3};
+use coma_pose_graph::blocks::coarse::News;
+use coma_pose_graph::blocks::field::Field;
 use coma_pose_graph::blocks::{BlockAgent, BlockSettings, Boundary, Network, Simulation, blocks};
 use coma_pose_graph::g2o::{G2oGraph, G2oLimits};
 use coma_pose_graph::gnc::{self, RobustSettings, Trust};
@@ -150,21 +152,23 @@ fn strange_messages_change_nothing() {
     let mut other = new();
     let mut nan = Pose::identity();
     nan.translation.vector.x = f64::NAN;
+    // Of points that the grid does not have.
+    let field = Field { motions: vec![Tangent::repeat(9.0); 3], ..Field::default() };
     let message = Boundary {
         from: 1,
         sequence: u64::MAX,
         heard: u64::MAX,
         poses: vec![(10, nan), (0, Pose::translation(9.0, 0.0, 0.0)), (777, Pose::identity())],
         weights: vec![(0, -1.0), (u32::MAX, 0.5)],
-        round: 0,
-        have: vec![u32::MAX],
-        towards: u64::MAX,
-        summaries: Vec::new(),
+        coarse: News { edition: u64::MAX, begun: true, heard: u64::MAX, field: Some(field), ..News::default() },
     };
     agent.receive(&Boundary { from: 9, ..message.clone() });
     agent.receive(&message);
     // From a round that cannot be.
-    agent.receive(&Boundary { round: 5, poses: vec![(10, Pose::identity())], ..message });
+    let coarse = News { round: 5, ..message.coarse.clone() };
+    agent.receive(&Boundary { coarse, poses: vec![(10, Pose::identity())], ..message.clone() });
+    let coarse = News { round: 1, ..message.coarse.clone() };
+    agent.receive(&Boundary { coarse, poses: vec![(10, Pose::identity())], ..message });
     agent.step().unwrap();
     other.step().unwrap();
     assert_eq!(agent.poses(), other.poses());

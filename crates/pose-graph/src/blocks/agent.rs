@@ -41,7 +41,7 @@ pub struct BlockSettings {
 impl Default for BlockSettings {
     fn default() -> Self {
         BlockSettings {
-            iterations_per_step: 3,
+            iterations_per_step: 1,
             most_momentum: 0.5,
             still_m: 1e-5,
             still_rad: 1e-6,

@@ -16,7 +16,7 @@ use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 
 /// The largest turn of a point in one round, radians: what is linearised holds no farther.
-const MOST_RAD: f64 = 0.3;
+const MOST_RAD: f64 = 1.0;
 /// Largest magnitude of a number that is believed.
 const MOST: f64 = 1e30;
 /// Most points of a grid.

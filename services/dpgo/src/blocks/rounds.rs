@@ -5,7 +5,7 @@ use coma_geometry::Tangent;
 use coma_pose_graph::blocks::coarse::News;
 use coma_pose_graph::blocks::field::{Field, Grid, MOST_POINTS, Part};
 use coma_wire::{At, FieldError, Wire, v1};
-use nalgebra::{SMatrix, Vector3};
+use coma_geometry::nalgebra::{SMatrix, Vector3};
 
 /// A point of a grid and half of the 26 around it.
 const MAX_PAIRS: usize = 14 * MOST_POINTS;
@@ -105,7 +105,7 @@ fn read_field(m: v1::BlockField, at: &At<'_>) -> Result<Field, FieldError> {
     motions_at.at_most(m.motions.len(), 6 * MOST_POINTS, "numbers")?;
     exactly(m.motions.len(), 6 * (m.motions.len() / 6), &motions_at)?;
     let next_at = at.field("next");
-    let next: v1::BlockGrid = m.next.ok_or_else(|| next_at.refuse("missing"))?;
+    let next: v1::BlockGrid = m.next.ok_or_else(|| next_at.refuse("is missing"))?;
     let points_at = next_at.field("points");
     let points = <[u32; 3]>::try_from(next.points)
         .map_err(|points| points_at.refuse(format!("{} numbers, 3 are needed", points.len())))?;
