@@ -144,7 +144,8 @@ fn by_blocks(
         wall_ms += took.wall_ms;
         let placed: Option<Vec<Pose>> = simulation.poses(problem.nodes).into_iter().collect();
         excess = placed.map(|poses| problem.cost(&poses, &weights) / goal - 1.0);
-        let above = excess.map_or("not placed".into(), |e| format!("{:.2} % above the central cost", e * 100.0));
+        let above =
+            excess.map_or("not placed".into(), |e| format!("{:.2} % above the central cost", e * 100.0));
         bar.set_message(format!("round {}, {above}", simulation.rounds()));
     }
     bar.finish_and_clear();

@@ -213,7 +213,13 @@ fn strange_messages_change_nothing() {
         heard: u64::MAX,
         poses: vec![(10, nan), (0, Pose::translation(9.0, 0.0, 0.0)), (777, Pose::identity())],
         weights: vec![(0, -1.0), (u32::MAX, 0.5)],
-        coarse: News { edition: u64::MAX, begun: true, heard: u64::MAX, field: Some(field), ..News::default() },
+        coarse: News {
+            edition: u64::MAX,
+            begun: true,
+            heard: u64::MAX,
+            field: Some(field),
+            ..News::default()
+        },
     };
     agent.receive(&Boundary { from: 9, ..message.clone() });
     agent.receive(&message);

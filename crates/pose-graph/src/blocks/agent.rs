@@ -33,7 +33,7 @@ pub struct BlockSettings {
     pub most_changes_of_weight: u32,
     /// Steps between two rounds in which all blocks move together. 0 for none.
     pub coarse_every: u32,
-    /// Most points of the grid that such a round moves; there are as many as a message's size allows, about 700 bytes
+    /// Most points of the grid that such a round moves: more of them bend finer, and make a part larger by some 800 bytes
     /// each.
     pub coarse_points: usize,
 }
@@ -291,7 +291,8 @@ impl BlockAgent {
                 && (pose.rotation.quaternion().norm() - 1.0).abs() < 1e-6;
             if sound && self.block.neighbours.get(node) == Some(&message.from) {
                 self.busy = true;
-                let pose = if behind && !self.block.fixed.contains(node) { self.coarse.moved(pose) } else { *pose };
+                let pose =
+                    if behind && !self.block.fixed.contains(node) { self.coarse.moved(pose) } else { *pose };
                 if self.known.insert(*node, pose).is_none() {
                     self.local = None;
                 }
@@ -325,8 +326,7 @@ impl BlockAgent {
         self.busy |= self.is_in_doubt();
         self.take_part(was_busy);
         let again = self.idle_steps < PATIENCE;
-        let news: Vec<(News, bool)> =
-            self.neighbours.keys().map(|id| self.coarse.tell(*id, again)).collect();
+        let news: Vec<(News, bool)> = self.neighbours.keys().map(|id| self.coarse.tell(*id, again)).collect();
         let mut out = Vec::new();
         let decided = |e: &super::BlockEdge| e.trust != Trust::Full && self.decides(&e.constraint);
         for ((id, neighbour), (coarse, due)) in self.neighbours.iter().zip(news) {

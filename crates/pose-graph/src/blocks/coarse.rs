@@ -6,7 +6,8 @@
 //! All that is said is a state under a number, so that loss, delay, repetition and disorder cost time alone.
 
 use super::BlockId;
-use super::field::{Field, Grid, Part};
+use super::field::{Field, Part};
+use super::grid::Grid;
 use coma_geometry::Pose;
 use std::collections::BTreeMap;
 

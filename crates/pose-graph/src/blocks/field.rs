@@ -1,26 +1,20 @@
 //! Smooth motions of all blocks together: the slow part of a block-by-block solve in few numbers.
 //!
 //! What descent block by block is slow at is smooth in space: the whole map bends, or one side of it shifts against the
-//! other. So the points of a coarse grid over the map get a motion each, six numbers, and every node moves as the points
-//! around it say. How a node's displacement follows from the turns of the points around it (half the lever arm, as
-//! linked interpolation of plates has it) keeps what bends evenly free of shear.
-//!
-//! Each block says what its measurements are worth for these motions ([`Part`]); parts add up, and the sum over all
+//! other. So the points of a coarse [`Grid`] over the map get a motion each, and every node moves as the points around it
+//! say. Each block says what its measurements are worth for these motions ([`Part`]); parts add up, and the sum over all
 //! blocks gives the [`Field`] that lowers the cost most.
 
+use super::grid::{Grid, MOST};
 use super::{Block, BlockId, NodeId};
 use crate::residual::linearise;
 use crate::sparse::BlockCholesky;
 use coma_geometry::{Matrix6, Pose, Tangent};
-use nalgebra::{Matrix3, SMatrix, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, SMatrix, Vector3};
 use std::collections::BTreeMap;
 
 /// The largest turn of a point in one round, radians: what is linearised holds no farther.
 const MOST_RAD: f64 = 1.0;
-/// Largest magnitude of a number that is believed.
-const MOST: f64 = 1e30;
-/// Most points of a grid.
-pub const MOST_POINTS: usize = 4096;
 /// So many nodes for each point of a grid, at least.
 const NODES_PER_POINT: usize = 8;
 /// Damping as a share of the diagonal: parts are summed in single precision.
@@ -28,115 +22,6 @@ const DAMPING: f64 = 1e-6;
 /// How stiffly points that are side by side hang together, as a share of the mean diagonal: one with hardly a node around
 /// it goes along.
 const STIFFNESS: f64 = 1e-3;
-
-/// Points in a regular grid, in the map's frame; along an axis that the map hardly extends in there is one layer.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Grid {
-    /// Its first point, metres.
-    pub origin: Vector3<f64>,
-    /// Between two points, metres.
-    pub spacing_m: f64,
-    /// Along each axis; x varies fastest.
-    pub points: [u32; 3],
-}
-
-impl Grid {
-    /// The finest grid of at most so many points over a box.
-    fn over(low: &Vector3<f64>, high: &Vector3<f64>, most: usize) -> Self {
-        let extent = high - low;
-        let points = |spacing_m: f64| {
-            [0, 1, 2].map(|axis| match extent[axis] / spacing_m {
-                steps if steps >= 1.0 => steps.round().min(MOST_POINTS as f64) as u32 + 1,
-                _ => 1,
-            })
-        };
-        let count = |spacing_m: f64| points(spacing_m).iter().map(|n| *n as usize).product::<usize>();
-        let mut spacing_m = 2.0 * extent.max();
-        if !(spacing_m > 0.0 && spacing_m <= MOST) {
-            return Grid::default();
-        }
-        while count(0.9 * spacing_m) <= most.min(MOST_POINTS) {
-            spacing_m *= 0.9;
-        }
-        let points = points(spacing_m);
-        let half = Vector3::from_fn(|axis, _| 0.5 * spacing_m * f64::from(points[axis] - 1));
-        Grid { origin: (low + high) * 0.5 - half, spacing_m, points }
-    }
-
-    /// How many points.
-    pub fn len(&self) -> usize {
-        self.points.iter().map(|n| *n as usize).product()
-    }
-
-    /// True of a grid without points, which moves nothing.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// True if it can be computed with.
-    pub fn is_sound(&self) -> bool {
-        let few = self.points.iter().try_fold(1_u64, |all, n| all.checked_mul(u64::from(*n)));
-        let placed = self.origin.iter().all(|x| x.abs() <= MOST);
-        few.is_some_and(|n| n <= MOST_POINTS as u64)
-            && (self.is_empty() || placed && self.spacing_m > 0.0 && self.spacing_m <= MOST)
-    }
-
-    /// The points around a place, and the motion there (displacement, turn; in the map's frame) for each one's.
-    fn around(&self, place: &Vector3<f64>) -> Vec<(u32, Matrix6)> {
-        if self.is_empty() {
-            return Vec::new();
-        }
-        let mut around = vec![(0, 1.0, Vector3::zeros())];
-        for axis in [2, 1, 0] {
-            let count = self.points[axis];
-            let along = place[axis] - self.origin[axis];
-            // A flat grid turns as a plate; within a cell half the arm belongs to each side.
-            let arm = if count == 1 { 1.0 } else { 0.5 };
-            let first = ((along / self.spacing_m).max(0.0) as u32).min(count.saturating_sub(2));
-            let share = (along / self.spacing_m - f64::from(first)).clamp(-0.5, 1.5);
-            let sides: &[(u32, f64)] = if count == 1 { &[(0, 1.0)] } else { &[(0, 1.0 - share), (1, share)] };
-            let split = |(index, weight, lever): (u32, f64, Vector3<f64>)| {
-                sides.iter().map(move |(side, part)| {
-                    let mut lever = lever;
-                    lever[axis] = arm * (along - self.spacing_m * f64::from(first + side));
-                    (index * count + first + side, weight * part, lever)
-                })
-            };
-            around = around.into_iter().flat_map(split).collect();
-        }
-        let motion = |(index, weight, lever): (u32, f64, Vector3<f64>)| {
-            let mut motion = Matrix6::identity();
-            // turn x lever
-            motion.fixed_view_mut::<3, 3>(0, 3).copy_from(&-lever.cross_matrix());
-            (index, motion * weight)
-        };
-        around.into_iter().map(motion).collect()
-    }
-
-    /// The points that come next along each axis, and the way there.
-    fn next_to(&self, point: u32) -> impl Iterator<Item = (u32, Vector3<f64>)> + '_ {
-        let strides = [1, self.points[0], self.points[0] * self.points[1]];
-        (0..3).filter_map(move |axis| {
-            let along = point / strides[axis] % self.points[axis].max(1);
-            let mut way = Vector3::zeros();
-            way[axis] = self.spacing_m;
-            (along + 1 < self.points[axis]).then_some((point + strides[axis], way))
-        })
-    }
-
-    /// Where a pose is moved to when the grid's points move so.
-    pub(super) fn moved(&self, motions: &[Tangent], map_from_node: &Pose) -> Pose {
-        let mut motion = Tangent::zeros();
-        for (point, here) in self.around(&map_from_node.translation.vector) {
-            motion += motions.get(point as usize).map_or_else(Tangent::zeros, |m| here * m);
-        }
-        let mut moved = *map_from_node;
-        moved.translation.vector += motion.fixed_rows::<3>(0);
-        moved.rotation = UnitQuaternion::from_scaled_axis(motion.fixed_rows::<3>(3)) * moved.rotation;
-        moved.rotation.renormalize();
-        moved
-    }
-}
 
 /// What a block sees: poses in the map's frame, and one weight per measurement.
 pub(super) struct Sight<'a> {
@@ -212,7 +97,8 @@ impl Part {
                 });
             }
             let ends = [(ends[0], at.wrt_i), (ends[1], at.wrt_j)];
-            let mine = ends.iter().find_map(|(node, _)| block.neighbours.get(node)).is_none_or(|b| block.id < *b);
+            let mine =
+                ends.iter().find_map(|(node, _)| block.neighbours.get(node)).is_none_or(|b| block.id < *b);
             if mine && *weight > 0.0 {
                 let towards = towards(&ends, &around);
                 for (point, wrt_point) in &towards {
@@ -264,7 +150,11 @@ impl Part {
             motions.iter_mut().for_each(|m| *m *= MOST_RAD / farthest);
         }
         let most = most_points.min(self.nodes as usize / NODES_PER_POINT);
-        Field { motions, largest_squared: self.largest_squared, next: Grid::over(&self.low, &self.high, most) }
+        Field {
+            motions,
+            largest_squared: self.largest_squared,
+            next: Grid::over(&self.low, &self.high, most),
+        }
     }
 
     fn minimum(&self, grid: &Grid) -> Option<Vec<(u32, Tangent)>> {
@@ -310,7 +200,8 @@ impl Part {
 
     /// Size as plain numbers: 4 bytes a block, a point and each of a hessian's 36 numbers, 8 for all others.
     pub fn bytes(&self) -> usize {
-        let lists = 4 + 4 * self.blocks.len() + 4 + 4 * self.open.len() + 4 + self.gradient.len() * (4 + 6 * 8);
+        let lists =
+            4 + 4 * self.blocks.len() + 4 + 4 * self.open.len() + 4 + self.gradient.len() * (4 + 6 * 8);
         lists + 4 + 6 * 8 + 8 + 4 + self.hessian.len() * (2 * 4 + 36 * 4)
     }
 

@@ -2,10 +2,11 @@
 
 use super::names::Team;
 use coma_geometry::Tangent;
-use coma_pose_graph::blocks::coarse::News;
-use coma_pose_graph::blocks::field::{Field, Grid, MOST_POINTS, Part};
-use coma_wire::{At, FieldError, Wire, v1};
 use coma_geometry::nalgebra::{SMatrix, Vector3};
+use coma_pose_graph::blocks::coarse::News;
+use coma_pose_graph::blocks::field::{Field, Part};
+use coma_pose_graph::blocks::grid::{Grid, MOST_POINTS};
+use coma_wire::{At, FieldError, v1};
 
 /// A point of a grid and half of the 26 around it.
 const MAX_PAIRS: usize = 14 * MOST_POINTS;
@@ -76,7 +77,11 @@ fn read_part(m: v1::BlockPart, team: &Team, at: &At<'_>) -> Result<Part, FieldEr
         low: vector(&m.low_m, &at.field("low_m"))?,
         high: vector(&m.high_m, &at.field("high_m"))?,
         largest_squared: m.largest_squared_error,
-        gradient: m.points.into_iter().zip(m.gradient.chunks_exact(6).map(Tangent::from_column_slice)).collect(),
+        gradient: m
+            .points
+            .into_iter()
+            .zip(m.gradient.chunks_exact(6).map(Tangent::from_column_slice))
+            .collect(),
         hessian: std::iter::zip(m.pairs.chunks_exact(2), m.hessian.chunks_exact(36))
             .map(|(pair, block)| ((pair[0], pair[1]), SMatrix::from_row_slice(block)))
             .collect(),
