@@ -273,3 +273,51 @@ fn add(hessian: &mut BTreeMap<(u32, u32), Matrix6>, towards: &BTreeMap<u32, Matr
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn part(blocks: &[BlockId], open: &[BlockId], point: u32) -> Part {
+        Part {
+            blocks: blocks.to_vec(),
+            open: open.to_vec(),
+            nodes: 10,
+            low: Vector3::repeat(f64::from(point)),
+            high: Vector3::repeat(f64::from(point) + 1.0),
+            largest_squared: f64::from(point),
+            gradient: BTreeMap::from([(point, Tangent::repeat(1.0))]),
+            hessian: BTreeMap::from([((point, point), SMatrix::identity())]),
+        }
+    }
+
+    #[test]
+    fn parts_add_up_and_none_counts_twice() {
+        let (one, two) = (part(&[1], &[0, 2], 3), part(&[0, 4], &[1, 2], 3));
+        let sum = one.sum([&two].into_iter()).unwrap();
+        assert_eq!((sum.blocks.as_slice(), sum.open.as_slice(), sum.nodes), (&[0, 1, 4][..], &[2][..], 20));
+        assert_eq!(sum.gradient[&3], Tangent::repeat(2.0));
+        assert_eq!(sum.hessian[&(3, 3)], SMatrix::identity() * 2.0);
+        let far = one.sum([&part(&[2], &[1], 7)].into_iter()).unwrap();
+        assert!(
+            far.low.x == 3.0 && far.high.x == 8.0 && far.largest_squared == 7.0 && far.gradient.len() == 2
+        );
+        assert!(sum.sum([&part(&[4], &[], 1)].into_iter()).is_none());
+    }
+
+    #[test]
+    fn a_point_that_hardly_a_node_is_near_goes_along_with_the_others() {
+        let grid = Grid { origin: Vector3::zeros(), spacing_m: 1.0, points: [3, 1, 1] };
+        let mut part = part(&[0], &[], 0);
+        for (point, worth) in [(0, 1.0), (1, 1.0), (2, 1e-12_f32)] {
+            // The two that are seen are drawn sideways; what little the third says, it says loudly.
+            let pull = Tangent::new(0.0, -0.5, 0.0, 0.0, 0.0, 0.0);
+            part.gradient.insert(point, if point == 2 { pull * 1e-9 } else { pull });
+            part.hessian.insert((point, point), SMatrix::identity() * worth);
+        }
+        let field = part.field(&grid, 9);
+        for motion in &field.motions {
+            assert!((motion - Tangent::new(0.0, 0.5, 0.0, 0.0, 0.0, 0.0)).norm() < 0.01, "{motion}");
+        }
+    }
+}
