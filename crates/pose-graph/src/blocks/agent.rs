@@ -124,6 +124,8 @@ pub struct BlockAgent {
     coarse: Coarse,
     /// Descents since the last round.
     descents: u32,
+    /// A round has moved all, and nothing was done since.
+    has_followed: bool,
     /// Steps since the last that descended.
     idle_steps: u32,
     /// Something was heard, or a descent is not finished.
@@ -169,6 +171,7 @@ impl BlockAgent {
             local: None,
             coarse,
             descents: 0,
+            has_followed: false,
             idle_steps: 0,
             busy: true,
             iterations: 0,
@@ -242,9 +245,7 @@ impl BlockAgent {
         self.known.clear();
         self.said.clear();
         self.sequence = 0;
-        self.moved.clear();
-        self.momentum = 0.0;
-        (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
+        self.forget_motion();
         self.local = None;
         let neighbours = self.neighbours.keys().copied();
         self.coarse = Coarse::new(self.block.id, neighbours, self.settings.coarse_points);
@@ -394,7 +395,7 @@ impl BlockAgent {
                 *pose = self.coarse.moved(pose);
             }
         }
-        self.descents = 0;
+        (self.descents, self.has_followed) = (0, true);
         (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
         self.busy = true;
         if !matches!(self.doubt, Doubt::Decided) && self.graduate(self.coarse.largest_squared()) {
@@ -411,14 +412,24 @@ impl BlockAgent {
                 let placed = self.poses.len();
                 local.place(&mut self.poses, &self.known, &self.weights)?;
                 if self.poses.len() > placed {
-                    self.momentum = 0.0;
-                    self.moved.clear();
-                    self.usual_step = 0.0;
-                    self.least_step = f64::INFINITY;
+                    self.forget_motion();
                 }
             }
         }
+        if std::mem::take(&mut self.has_followed)
+            && let Some(local) = &self.local
+            && let Some(better) = local.unfolded(&self.poses, &self.known, &self.weights)?
+        {
+            self.poses.extend(better);
+            self.forget_motion();
+        }
         Ok(())
+    }
+
+    fn forget_motion(&mut self) {
+        self.moved.clear();
+        self.momentum = 0.0;
+        (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
     }
 
     /// Moves the block's nodes to the minimum that they have while all others stay, and on in the direction of the last

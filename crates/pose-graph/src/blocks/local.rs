@@ -112,6 +112,22 @@ impl Local {
         Ok(())
     }
 
+    /// Where the block's own nodes lie if they are placed anew, by the chordal relaxation with all others held. `None`
+    /// unless that is better than where they are: then they are caught in a fold, out of which no descent leads.
+    pub fn unfolded(
+        &self,
+        own: &BTreeMap<NodeId, Pose>,
+        known: &BTreeMap<NodeId, Pose>,
+        weights: &[f64],
+    ) -> Result<Option<BTreeMap<NodeId, Pose>>, SolveError> {
+        let here: Vec<Pose> = self.poses(own, known).iter().map(|p| p.unwrap_or_default()).collect();
+        let weights = self.weights(weights);
+        let found = chordal(self.solver.problem(), &here, &weights)?;
+        let better = self.solver.cost(&found, &weights) < self.solver.cost(&here, &weights);
+        let free = self.nodes.iter().zip(found).zip(&self.free).filter(|(_, free)| **free);
+        Ok(better.then(|| free.map(|(placed, _)| (*placed.0, placed.1)).collect()))
+    }
+
     /// The minimum over the block's own nodes, from where they are.
     pub fn solve(
         &mut self,
