@@ -122,7 +122,7 @@ pub struct BlockAgent {
     /// The problem over what is placed and known at present.
     local: Option<Local>,
     coarse: Coarse,
-    /// Descents since the last round.
+    /// Descents since the last round that were worth telling, or left something in doubt.
     descents: u32,
     /// A round has moved all, and nothing was done since.
     has_followed: bool,
@@ -317,12 +317,14 @@ impl BlockAgent {
             self.busy = false;
             self.place()?;
             self.descend()?;
-            self.descents += 1;
             let changed = self.reweigh();
-            if changed || self.has_moved() {
+            let moved = changed || self.has_moved();
+            if moved {
                 self.sequence += 1;
                 self.said.clone_from(&self.poses);
             }
+            // What is at rest needs no round, or there would be no end of them.
+            self.descents += u32::from(moved || self.is_in_doubt());
         }
         self.busy |= self.is_in_doubt();
         self.take_part(was_busy);
