@@ -18,6 +18,8 @@ use serde::{Deserialize, Serialize};
 pub struct AlignSettings {
     /// Gauss-Newton steps per level, from coarse to fine; as many levels as numbers.
     pub steps: Vec<usize>,
+    /// A step shorter than this, metres and radians alike, is the last of its level.
+    pub settled: f64,
     /// Only every n-th pixel of the finest level is used, in both directions.
     pub finest_stride: usize,
     /// Points farther apart than this many sigma(z) plus `max_distance_m` are no match.
@@ -44,6 +46,7 @@ impl Default for AlignSettings {
     fn default() -> Self {
         AlignSettings {
             steps: vec![8, 6],
+            settled: 2e-4,
             finest_stride: 1,
             max_distance_sigma: 8.0,
             max_distance_m: 0.06,
@@ -164,7 +167,7 @@ pub fn align(
             if !(delta.norm() < 10.0) {
                 return None;
             }
-            if step > 0 && delta.norm() < 2e-5 {
+            if step > 0 && delta.norm() < settings.settled {
                 break;
             }
         }
@@ -204,20 +207,22 @@ struct Problem<'a> {
     settings: &'a AlignSettings,
 }
 
-/// Bins of a histogram over sizes that span many powers of ten.
-const BINS: usize = 96;
-/// Bins in a factor of two.
-const BINS_PER_OCTAVE: f32 = 6.0;
+/// Bins of a histogram over sizes that span many powers of two: 16 of them.
+const BINS: usize = 128;
+/// A number's bits from here on are its bin: the exponent and three bits of the mantissa, 8 bins in a factor of two.
+const BIN_SHIFT: u32 = 20;
+/// Bits of the smallest size that has a bin of its own, `2^-12`.
+const SMALLEST_BITS: u32 = (127 - 12) << 23;
 
-/// Counts sizes in logarithmic bins from `2^-12` on; its median is exact to a bin and needs no order.
+/// Counts sizes in bins whose widths grow with them, from `2^-12` on; its median is exact to a bin and needs no order.
 #[derive(Clone, Copy)]
 struct Histogram([u32; BINS]);
 
 impl Histogram {
     #[inline]
     fn add(&mut self, size: f32) {
-        let bin = ((size.max(1e-9).log2() + 12.0) * BINS_PER_OCTAVE) as i32;
-        self.0[bin.clamp(0, BINS as i32 - 1) as usize] += 1;
+        let bin = size.abs().to_bits().saturating_sub(SMALLEST_BITS) >> BIN_SHIFT;
+        self.0[(bin as usize).min(BINS - 1)] += 1;
     }
 
     fn median(&self) -> f64 {
@@ -226,8 +231,9 @@ impl Histogram {
         for (bin, count) in self.0.iter().enumerate() {
             if seen + count > half {
                 // Linear inside the bin.
-                let inside = (half - seen) as f32 / (*count).max(1) as f32;
-                return ((bin as f32 + inside) / BINS_PER_OCTAVE - 12.0).exp2() as f64;
+                let begin = |bin: usize| f32::from_bits(SMALLEST_BITS + ((bin as u32) << BIN_SHIFT)) as f64;
+                let inside = (half - seen) as f64 / (*count).max(1) as f64;
+                return begin(bin) + (begin(bin + 1) - begin(bin)) * inside;
             }
             seen += count;
         }
@@ -359,8 +365,10 @@ impl Problem<'_> {
             let top = reference[(iu, iv)] * (1.0 - fu) + reference[(iu + 1, iv)] * fu;
             let bottom = reference[(iu, iv + 1)] * (1.0 - fu) + reference[(iu + 1, iv + 1)] * fu;
             let warped = top * (1.0 - fv) + bottom * fv;
-            let g = target.gradient[nearest];
-            let (gu, gv) = (g[0] * rfx * inv_z, g[1] * rfy * inv_z);
+            // Central differences; `nearest` has a neighbour on every side.
+            let (x_ref, y_ref) = nearest;
+            let gu = 0.5 * (reference[(x_ref + 1, y_ref)] - reference[(x_ref - 1, y_ref)]) * rfx * inv_z;
+            let gv = 0.5 * (reference[(x_ref, y_ref + 1)] - reference[(x_ref, y_ref - 1)]) * rfy * inv_z;
             for (column, value) in matches.point.iter_mut().zip([p.x, p.y, p.z]) {
                 column.push(value);
             }

@@ -91,6 +91,7 @@ impl Default for TrackingSettings {
             adam: AdamSettings::default(),
             frame_to_model: AlignSettings {
                 steps: vec![4, 8],
+                settled: 2e-5,
                 max_distance_m: 0.04,
                 prior_m: 0.02,
                 prior_rad: 0.02,

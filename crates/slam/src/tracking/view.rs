@@ -26,8 +26,6 @@ pub struct Level {
     pub normal: Image<[f32; 3]>,
     /// 0..1. `[height, width]`
     pub intensity: Image<f32>,
-    /// Central differences of intensity per pixel. `[height, width]`
-    pub gradient: Image<[f32; 2]>,
 }
 
 impl Level {
@@ -98,9 +96,7 @@ impl TrackingView {
             drop_grazing(&mut normal, &camera);
             let margin = if level == 0 { JUMP_MARGIN_PX } else { 1 };
             let trusted = away_from_jumps(&depth_m, jump, margin);
-            let gradient = central_gradient(&intensity);
-            let intensity = intensity.clone();
-            out.push(Arc::new(Level { camera, depth_m: trusted, normal, intensity, gradient }));
+            out.push(Arc::new(Level { camera, depth_m: trusted, normal, intensity: intensity.clone() }));
         }
         TrackingView { levels: out, noise }
     }
@@ -150,21 +146,6 @@ fn away_from_jumps(depth_m: &Image<f32>, relative: f32, margin: usize) -> Image<
             if rows.clone().any(|r| near[(x, r)]) {
                 *z = 0.0;
             }
-        }
-    });
-    out
-}
-
-fn central_gradient(intensity: &Image<f32>) -> Image<[f32; 2]> {
-    let (width, height) = (intensity.width(), intensity.height());
-    let mut out = Image::filled(width, height, [0.0f32; 2]);
-    out.pixels_mut().par_chunks_mut(width).enumerate().for_each(|(y, row)| {
-        if y == 0 || y + 1 >= height {
-            return;
-        }
-        let (above, here, below) = (intensity.row(y - 1), intensity.row(y), intensity.row(y + 1));
-        for x in 1..width.saturating_sub(1) {
-            row[x] = [0.5 * (here[x + 1] - here[x - 1]), 0.5 * (below[x] - above[x])];
         }
     });
     out
