@@ -420,7 +420,7 @@ impl BlockAgent {
         }
         if std::mem::take(&mut self.has_followed)
             && let Some(local) = &self.local
-            && let Some(better) = local.unfolded(&self.poses, &self.known, &self.weights)?
+            && let Some(better) = local.placed_anew(&self.poses, &self.known, &self.weights)?
         {
             self.poses.extend(better);
             self.forget_motion();

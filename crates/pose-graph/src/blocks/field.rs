@@ -297,7 +297,7 @@ mod tests {
         let sum = one.sum([&two].into_iter()).unwrap();
         assert_eq!((sum.blocks.as_slice(), sum.open.as_slice(), sum.nodes), (&[0, 1, 4][..], &[2][..], 20));
         assert_eq!(sum.gradient[&3], Tangent::repeat(2.0));
-        assert_eq!(sum.hessian[&(3, 3)], SMatrix::identity() * 2.0);
+        assert_eq!(sum.hessian[&(3, 3)], SMatrix::<f32, 6, 6>::identity() * 2.0);
         let far = one.sum([&part(&[2], &[1], 7)].into_iter()).unwrap();
         assert!(
             far.low.x == 3.0 && far.high.x == 8.0 && far.largest_squared == 7.0 && far.gradient.len() == 2

@@ -113,8 +113,8 @@ impl Local {
     }
 
     /// Where the block's own nodes lie if they are placed anew, by the chordal relaxation with all others held. `None`
-    /// unless that is better than where they are: then they are caught in a fold, out of which no descent leads.
-    pub fn unfolded(
+    /// unless that costs less than where they are: then descent is caught in a minimum that is not the lowest.
+    pub fn placed_anew(
         &self,
         own: &BTreeMap<NodeId, Pose>,
         known: &BTreeMap<NodeId, Pose>,
