@@ -2,19 +2,19 @@
 
 use super::blocks::NetworkArguments;
 use super::clock::{Spent, timed};
+use crate::progress;
 use crate::synth::graph::{Team, graph};
 use anyhow::{Context, anyhow, ensure};
 use clap::Args;
 use coma_evaluation::{Growth, Line, growth_svg};
 use coma_geometry::{Pose, SubmapId};
 use coma_pose_graph::blocks::cut::blocks_of;
-use coma_pose_graph::blocks::{BlockSettings, Simulation};
+use coma_pose_graph::blocks::{BlockAgent, BlockSettings, Simulation};
 use coma_pose_graph::g2o::G2oGraph;
 use coma_pose_graph::team::{self, Believed};
 use coma_pose_graph::{Component, GlobalSettings, LoopWeight, solve};
 use serde::Serialize;
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::path::PathBuf;
 
 /// Solves the graphs of `coma synth graph` for teams of several sizes.
@@ -58,15 +58,25 @@ struct Blocks {
     rounds: u64,
     /// Above the central cost, as a share; `None` if not every submap has found its place.
     excess: Option<f64>,
+    /// Rounds in which all have moved together.
+    coarse_rounds: u64,
     bytes_per_agent: u64,
     cpu_ms_per_agent: f64,
+    wall_ms: f64,
 }
 
 /// Runs it.
 pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut rows = Vec::new();
+    if !arguments.json {
+        print!("{HEAD}");
+    }
     for size in &arguments.sizes {
-        rows.push(row(&Team { agents: *size, ..arguments.team.clone() }, arguments)?);
+        let row = row(&Team { agents: *size, ..arguments.team.clone() }, arguments)?;
+        if !arguments.json {
+            println!("{}", line(&row));
+        }
+        rows.push(row);
     }
     if let Some(path) = &arguments.svg {
         let svg = growth_svg(&panels(&rows)).map_err(|e| anyhow!("the growth cannot be drawn: {e}"))?;
@@ -74,8 +84,6 @@ pub fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     if arguments.json {
         println!("{}", serde_json::to_string_pretty(&rows)?);
-    } else {
-        print!("{}", table(&rows));
     }
     Ok(())
 }
@@ -124,7 +132,8 @@ fn by_blocks(
     let begin = |node: u32| central[node as usize];
     let mut simulation = Simulation::new(cut, begin, BlockSettings::default(), network.network());
     let mut excess = None;
-    let mut cpu_ms = 0.0;
+    let (mut cpu_ms, mut wall_ms) = (0.0, 0.0);
+    let bar = progress::spinner(&format!("{} agents, block by block", team.agents));
     while simulation.rounds() < network.rounds
         && !simulation.is_settled()
         && !excess.is_some_and(|e: f64| e <= 1e-3)
@@ -132,14 +141,21 @@ fn by_blocks(
         let (stepped, took) = timed(|| simulation.round());
         stepped?;
         cpu_ms += took.cpu_ms;
+        wall_ms += took.wall_ms;
         let placed: Option<Vec<Pose>> = simulation.poses(problem.nodes).into_iter().collect();
         excess = placed.map(|poses| problem.cost(&poses, &weights) / goal - 1.0);
+        let above =
+            excess.map_or("not placed".into(), |e| format!("{:.2} % above the central cost", e * 100.0));
+        bar.set_message(format!("round {}, {above}", simulation.rounds()));
     }
+    bar.finish_and_clear();
     Ok(Blocks {
         rounds: simulation.rounds(),
         excess,
+        coarse_rounds: simulation.agents().iter().map(BlockAgent::coarse_rounds).min().unwrap_or(0),
         bytes_per_agent: simulation.traffic.bytes / team.agents as u64,
         cpu_ms_per_agent: cpu_ms / team.agents as f64,
+        wall_ms,
     })
 }
 
@@ -165,35 +181,33 @@ fn panels(rows: &[Row]) -> Vec<Growth> {
     ]
 }
 
-fn table(rows: &[Row]) -> String {
-    let mut out = String::from(
-        "| agents | submaps | loops | used | central wall s | central CPU s | steps | cost | block rounds | above central | kB an agent | CPU ms an agent |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|\n",
-    );
-    for r in rows {
-        let _ = write!(
-            out,
-            "| {} | {} | {} | {} | {:.2} | {:.2} | {} | {:.1} |",
-            r.agents,
-            r.submaps,
-            r.loops,
-            r.loops_used,
-            r.central.wall_ms / 1e3,
-            r.central.cpu_ms / 1e3,
-            r.central_steps,
-            r.cost
-        );
-        let _ = match &r.blocks {
-            Some(b) => writeln!(
-                out,
-                " {} | {} | {:.1} | {:.0} |",
-                b.rounds,
-                b.excess.map_or("not placed".into(), |e| format!("{:.3} %", e * 100.0)),
-                b.bytes_per_agent as f64 / 1e3,
-                b.cpu_ms_per_agent
-            ),
-            None => writeln!(out, " | | | |"),
-        };
-    }
-    out
+const HEAD: &str = "\
+| agents | submaps | loops | used | central wall s | central CPU s | steps | cost | block rounds | together | above central | kB an agent | CPU s an agent | wall s, all in one process |
+|---|---|---|---|---|---|---|---|---|---|---|---|---|---|
+";
+
+fn line(r: &Row) -> String {
+    let blocks = match &r.blocks {
+        Some(b) => format!(
+            "{} | {} | {} | {:.0} | {:.2} | {:.1}",
+            b.rounds,
+            b.coarse_rounds,
+            b.excess.map_or("not placed".into(), |e| format!("{:.3} %", e * 100.0)),
+            b.bytes_per_agent as f64 / 1e3,
+            b.cpu_ms_per_agent / 1e3,
+            b.wall_ms / 1e3
+        ),
+        None => " | | | | |".into(),
+    };
+    format!(
+        "| {} | {} | {} | {} | {:.2} | {:.2} | {} | {:.1} | {blocks} |",
+        r.agents,
+        r.submaps,
+        r.loops,
+        r.loops_used,
+        r.central.wall_ms / 1e3,
+        r.central.cpu_ms / 1e3,
+        r.central_steps,
+        r.cost
+    )
 }

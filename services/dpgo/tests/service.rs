@@ -7,16 +7,9 @@ use coma_geometry::{Pose, SubmapId, se3};
 use coma_runtime::{ByteLedger, Class, channel};
 use coma_wire::entries::*;
 use coma_wire::v1::dpgo_client::DpgoClient;
-use coma_wire::{At, Wire, field_errors_of, v1};
+use coma_wire::{At, Wire, v1};
 use common::*;
-use tonic::{Code, Status};
-
-#[track_caller]
-fn assert_refused<T: std::fmt::Debug>(answer: Result<T, Status>, field: &str) {
-    let status = answer.expect_err(field);
-    assert_eq!(status.code(), Code::InvalidArgument, "{status}");
-    assert_eq!(field_errors_of(&status)[0].field, field, "{status}");
-}
+use tonic::Code;
 
 fn pose_of(component: &v1::Component, id: &SubmapId) -> Pose {
     let found = component.poses.iter().find(|p| p.submap_id == Some(id.to_wire())).expect("a pose");

@@ -1,7 +1,8 @@
 //! One agent of a block-by-block solve, as a state machine: [`BlockAgent::receive`] takes what others say,
 //! [`BlockAgent::step`] descends once and gives what there is to say. It knows no clock and no network.
 
-use super::coarse::{Coarse, Summary};
+use super::coarse::{Coarse, News};
+use super::field::{Part, Sight};
 use super::local::Local;
 use super::message::Boundary;
 use super::{Block, BlockId, NodeId};
@@ -9,7 +10,7 @@ use crate::gnc::{Kernel, Schedule, Trust, final_weight};
 use crate::solver::{Constraint, SolveError, SolverSettings};
 use coma_geometry::{Pose, Tangent, se3};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 /// How an agent descends.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -30,17 +31,17 @@ pub struct BlockSettings {
     pub convexity_step: f64,
     /// How often a measurement's weight may change under the robust cost itself.
     pub most_changes_of_weight: u32,
-    /// Steps between two rounds in which whole blocks move. 0 for none.
+    /// Steps between two rounds in which all blocks move together. 0 for none.
     pub coarse_every: u32,
-    /// A block with more neighbours takes no part in that: what everybody has to know of it would be too much, and where
-    /// blocks have many neighbours news travels fast anyway.
-    pub coarse_most_neighbours: usize,
+    /// Most points of the grid that such a round moves: more of them bend finer, and make a part larger by some 800 bytes
+    /// each.
+    pub coarse_points: usize,
 }
 
 impl Default for BlockSettings {
     fn default() -> Self {
         BlockSettings {
-            iterations_per_step: 3,
+            iterations_per_step: 1,
             most_momentum: 0.5,
             still_m: 1e-5,
             still_rad: 1e-6,
@@ -48,7 +49,7 @@ impl Default for BlockSettings {
             convexity_step: 1.4,
             most_changes_of_weight: 4,
             coarse_every: 6,
-            coarse_most_neighbours: 16,
+            coarse_points: 128,
         }
     }
 }
@@ -87,10 +88,6 @@ struct Neighbour {
     has_heard: u64,
     /// Nodes of ours that it has measurements to.
     boundary: Vec<NodeId>,
-    /// Coarse rounds that it has seen.
-    round: u64,
-    /// Of whom it knows the part in the next one.
-    have: BTreeSet<BlockId>,
 }
 
 /// The state of one agent.
@@ -125,8 +122,10 @@ pub struct BlockAgent {
     /// The problem over what is placed and known at present.
     local: Option<Local>,
     coarse: Coarse,
-    /// Descents since the last round.
+    /// Descents since the last round that were worth telling, or left something in doubt.
     descents: u32,
+    /// A round has moved all, and nothing was done since.
+    has_followed: bool,
     /// Steps since the last that descended.
     idle_steps: u32,
     /// Something was heard, or a descent is not finished.
@@ -150,8 +149,9 @@ impl BlockAgent {
             neighbour.boundary.sort_unstable();
             neighbour.boundary.dedup();
         }
+        let coarse = Coarse::new(block.id, neighbours.keys().copied(), settings.coarse_points);
         BlockAgent {
-            poses: block.fixed.iter().map(|node| (*node, start(*node))).collect(),
+            poses: block.fixed.iter().filter(|n| block.owns(n)).map(|node| (*node, start(*node))).collect(),
             weights: block.edges.iter().map(|e| e.weight).collect(),
             changes_of_weight: vec![0; block.edges.len()],
             doubt: Doubt::NotYet,
@@ -169,8 +169,9 @@ impl BlockAgent {
             farthest_m: 0.0,
             farthest_rad: 0.0,
             local: None,
-            coarse: Coarse::default(),
+            coarse,
             descents: 0,
+            has_followed: false,
             idle_steps: 0,
             busy: true,
             iterations: 0,
@@ -199,7 +200,7 @@ impl BlockAgent {
         self.iterations
     }
 
-    /// Rounds in which whole blocks moved so far.
+    /// Rounds in which all moved together so far.
     pub fn coarse_rounds(&self) -> u64 {
         self.coarse.round
     }
@@ -228,12 +229,11 @@ impl BlockAgent {
         self.busy
     }
 
-    /// True if this block would not move by itself, every neighbour has heard where it is, and no round in which whole
-    /// blocks move is on its way. A round that does not come together, because a block takes no part, is not waited for
+    /// True if this block would not move by itself, every neighbour has heard where it is, and no round in which all
+    /// move is on its way. A round that does not come together, because a block takes no part, is not waited for
     /// forever.
     pub fn is_still(&self) -> bool {
-        let waits = self.takes_part() && self.coarse.has_begun() && self.idle_steps < PATIENCE;
-        !self.busy && !waits && self.neighbours.values().all(|n| n.has_heard >= self.sequence)
+        !self.busy && !self.waits() && self.neighbours.values().all(|n| n.has_heard >= self.sequence)
     }
 
     /// Forgets what was said and heard, and keeps where its nodes are and what it believes: a neighbour began anew.
@@ -245,18 +245,21 @@ impl BlockAgent {
         self.known.clear();
         self.said.clear();
         self.sequence = 0;
-        self.moved.clear();
-        self.momentum = 0.0;
-        (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
+        self.forget_motion();
         self.local = None;
-        self.coarse = Coarse::default();
+        let neighbours = self.neighbours.keys().copied();
+        self.coarse = Coarse::new(self.block.id, neighbours, self.settings.coarse_points);
         (self.descents, self.idle_steps) = (0, 0);
         self.busy = true;
     }
 
     /// True if there is nothing to do and every neighbour has heard all there is to hear.
     pub fn is_settled(&self) -> bool {
-        !self.busy && self.neighbours.values().all(|n| n.has_heard >= self.sequence && !n.owed)
+        self.is_still() && self.neighbours.values().all(|n| !n.owed)
+    }
+
+    fn waits(&self) -> bool {
+        self.takes_part() && self.coarse.has_begun() && self.idle_steps < PATIENCE
     }
 
     fn decides(&self, c: &Constraint) -> bool {
@@ -268,21 +271,14 @@ impl BlockAgent {
     pub fn receive(&mut self, message: &Boundary) {
         let Some(neighbour) = self.neighbours.get_mut(&message.from) else { return };
         neighbour.has_heard = neighbour.has_heard.max(message.heard.min(self.sequence));
-        neighbour.owed |= message.sequence > 0 || !message.summaries.is_empty();
-        if message.round > neighbour.round {
-            neighbour.round = message.round;
-            neighbour.have.clear();
+        let News { round, part, field, .. } = &message.coarse;
+        neighbour.owed |= message.sequence > 0 || part.is_some() || field.is_some();
+        if self.coarse.take(message.from, &message.coarse) {
+            self.follow();
         }
-        if message.round == neighbour.round {
-            neighbour.have.extend(&message.have);
-        }
-        for summary in &message.summaries {
-            self.coarse.take(message.towards, summary);
-        }
-        self.advance();
-        let carry = match self.coarse.round {
-            now if message.round == now => Pose::identity(),
-            now if message.round + 1 == now => self.coarse.moved(message.from),
+        let behind = match self.coarse.round {
+            now if *round == now => false,
+            now if *round + 1 == now => true,
             // Poses that cannot be told come again.
             _ => return,
         };
@@ -296,7 +292,9 @@ impl BlockAgent {
                 && (pose.rotation.quaternion().norm() - 1.0).abs() < 1e-6;
             if sound && self.block.neighbours.get(node) == Some(&message.from) {
                 self.busy = true;
-                if self.known.insert(*node, carry * pose).is_none() {
+                let pose =
+                    if behind && !self.block.fixed.contains(node) { self.coarse.moved(pose) } else { *pose };
+                if self.known.insert(*node, pose).is_none() {
                     self.local = None;
                 }
             }
@@ -319,30 +317,29 @@ impl BlockAgent {
             self.busy = false;
             self.place()?;
             self.descend()?;
-            self.descents += 1;
             let changed = self.reweigh();
-            if changed || self.has_moved() {
+            let moved = changed || self.has_moved();
+            if moved {
                 self.sequence += 1;
                 self.said.clone_from(&self.poses);
             }
+            // What is at rest needs no round, or there would be no end of them.
+            self.descents += u32::from(moved || self.is_in_doubt());
         }
         self.busy |= self.is_in_doubt();
-        self.summarise(was_busy);
+        self.take_part(was_busy);
+        let again = self.idle_steps < PATIENCE;
+        let news: Vec<(News, bool)> = self.neighbours.keys().map(|id| self.coarse.tell(*id, again)).collect();
         let mut out = Vec::new();
         let decided = |e: &super::BlockEdge| e.trust != Trust::Full && self.decides(&e.constraint);
-        let have: Vec<BlockId> = self.coarse.have().collect();
-        for (id, neighbour) in &self.neighbours {
-            let (towards, summaries) = self.coarse.lacking(neighbour.round, &neighbour.have);
+        for ((id, neighbour), (coarse, due)) in self.neighbours.iter().zip(news) {
             let mut message = Boundary {
                 from: self.block.id,
                 sequence: 0,
                 heard: neighbour.heard,
                 poses: Vec::new(),
                 weights: Vec::new(),
-                round: self.coarse.round,
-                have: have.clone(),
-                towards,
-                summaries,
+                coarse,
             };
             if neighbour.has_heard < self.sequence {
                 message.sequence = self.sequence;
@@ -357,7 +354,7 @@ impl BlockAgent {
                 let told = edges.filter(|(e, _)| decided(e) && leads_there(e));
                 message.weights = told.map(|(e, w)| (e.index, *w)).collect();
             }
-            if neighbour.owed || message.sequence > 0 || !message.summaries.is_empty() {
+            if neighbour.owed || message.sequence > 0 || due && self.takes_part() {
                 out.push((*id, message));
             }
         }
@@ -366,18 +363,22 @@ impl BlockAgent {
     }
 
     /// Says this block's part in the next coarse round: when it is time, or when someone else has begun it.
-    fn summarise(&mut self, was_busy: bool) {
-        let due = was_busy && self.descents >= self.settings.coarse_every || self.coarse.has_begun();
-        if !due || !self.takes_part() || self.coarse.has(self.block.id) {
+    fn take_part(&mut self, was_busy: bool) {
+        if !self.takes_part() {
             return;
         }
-        // What is decided shapes no one's doubts any more.
-        let undecided = if matches!(self.doubt, Doubt::Decided) { Vec::new() } else { self.doubts() };
-        let largest = undecided.iter().map(|(_, squared)| *squared).fold(0.0, f64::max);
-        let summary = Summary::new(&self.block, &self.poses, &self.known, &self.weights, largest);
-        if let Some(summary) = summary {
-            self.coarse.take(self.coarse.round + 1, &summary);
-            self.advance();
+        let due = was_busy && self.descents >= self.settings.coarse_every || self.coarse.has_begun();
+        if due && !self.coarse.has_said() {
+            // What is decided shapes no one's doubts any more.
+            let undecided = if matches!(self.doubt, Doubt::Decided) { Vec::new() } else { self.doubts() };
+            let largest = undecided.iter().map(|(_, squared)| *squared).fold(0.0, f64::max);
+            let sight = Sight { own: &self.poses, known: &self.known, weights: &self.weights };
+            if let Some(part) = Part::new(&self.block, &sight, self.coarse.grid(), largest) {
+                self.coarse.say(part);
+            }
+        }
+        if self.coarse.collect() {
+            self.follow();
         }
     }
 
@@ -386,27 +387,17 @@ impl BlockAgent {
     }
 
     fn takes_part(&self) -> bool {
-        self.settings.coarse_every > 0
-            && (1..=self.settings.coarse_most_neighbours).contains(&self.neighbours.len())
+        self.settings.coarse_every > 0 && !self.neighbours.is_empty()
     }
 
-    /// Moves whole blocks once everyone's part in a round is known.
-    fn advance(&mut self) {
-        if !self.coarse.advance() {
-            return;
+    /// Moves as the newest round has all move.
+    fn follow(&mut self) {
+        for (node, pose) in self.poses.iter_mut().chain(&mut self.said).chain(&mut self.known) {
+            if !self.block.fixed.contains(node) {
+                *pose = self.coarse.moved(pose);
+            }
         }
-        let own = self.coarse.moved(self.block.id);
-        for pose in self.poses.values_mut().chain(self.said.values_mut()) {
-            *pose = own * *pose;
-            pose.rotation.renormalize();
-        }
-        for (node, pose) in &mut self.known {
-            let block = self.block.neighbours.get(node).copied();
-            *pose = block.map_or_else(Pose::identity, |block| self.coarse.moved(block)) * *pose;
-        }
-        self.descents = 0;
-        self.momentum = 0.0;
-        self.moved.clear();
+        (self.descents, self.has_followed) = (0, true);
         (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
         self.busy = true;
         if !matches!(self.doubt, Doubt::Decided) && self.graduate(self.coarse.largest_squared()) {
@@ -423,14 +414,24 @@ impl BlockAgent {
                 let placed = self.poses.len();
                 local.place(&mut self.poses, &self.known, &self.weights)?;
                 if self.poses.len() > placed {
-                    self.momentum = 0.0;
-                    self.moved.clear();
-                    self.usual_step = 0.0;
-                    self.least_step = f64::INFINITY;
+                    self.forget_motion();
                 }
             }
         }
+        if std::mem::take(&mut self.has_followed)
+            && let Some(local) = &self.local
+            && let Some(better) = local.placed_anew(&self.poses, &self.known, &self.weights)?
+        {
+            self.poses.extend(better);
+            self.forget_motion();
+        }
         Ok(())
+    }
+
+    fn forget_motion(&mut self) {
+        self.moved.clear();
+        self.momentum = 0.0;
+        (self.usual_step, self.least_step) = (0.0, f64::INFINITY);
     }
 
     /// Moves the block's nodes to the minimum that they have while all others stay, and on in the direction of the last

@@ -1,199 +1,228 @@
-//! The coarse part of a block-by-block solve: whole blocks move as rigid bodies.
+//! Rounds in which all blocks move together, by a [`Field`].
 //!
-//! Descent block by block carries news one block a step, and a long row of blocks bends back but slowly. Between blocks
-//! that move rigidly there is a small problem of six unknowns each: every block says once a round what its measurements
-//! to others are worth for that ([`Summary`]), the summaries reach everyone over the neighbours, and whoever has all of
-//! a round solves the same small system and moves its own block. Nobody waits: descent goes on meanwhile, and where the
-//! summaries never come together it goes on alone.
+//! Who has the smallest number sums up: blocks make a tree of shortest ways to it, each adds to its own part those of the
+//! blocks below it, and once the sum is whole the field goes down the same ways. Who is told the field moves, and goes to
+//! the next round. Nobody waits: descent goes on meanwhile, and where the parts never come together it goes on alone.
+//! All that is said is a state under a number, so that loss, delay, repetition and disorder cost time alone.
 
-use super::{Block, BlockId, NodeId};
-use crate::residual::linearise;
-use crate::sparse::BlockCholesky;
-use coma_geometry::{Matrix6, Pose, Tangent, se3};
-use std::collections::{BTreeMap, BTreeSet};
+use super::BlockId;
+use super::field::{Field, Part};
+use super::grid::Grid;
+use coma_geometry::Pose;
+use std::collections::BTreeMap;
 
-/// The largest rotation of a block in one round, radians: what is linearised holds no farther.
-const MOST_RAD: f64 = 0.3;
-/// Largest magnitude of a number that is believed.
-const MOST: f64 = 1e30;
+/// What was not acknowledged is said again after so many steps.
+const REPEAT: u32 = 4;
 
-/// What the measurements between two blocks say of their rigid motions `a`, `b` (in the map's frame, on the left):
-/// `gradient . (b - a) + (b - a) . hessian (b - a) / 2`.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Link {
-    /// The block `b`; `a` is the summary's.
-    pub other: BlockId,
-    /// At no motion.
-    pub gradient: Tangent,
-    /// Symmetric.
-    pub hessian: Matrix6,
+/// What a block tells a neighbour of the rounds.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct News {
+    /// Rounds that have moved the block.
+    pub round: u64,
+    /// Rises with whatever it says of them.
+    pub edition: u64,
+    /// It has said its part in the next one.
+    pub begun: bool,
+    /// The smallest number that it has heard of,
+    pub root: BlockId,
+    /// and over how many blocks it is there.
+    pub depth: u32,
+    /// The reader is the next one on that way.
+    pub below: bool,
+    /// Edition of the reader's part that it has taken; 0 for none.
+    pub heard: u64,
+    /// Its own part in the next round with those of all below it.
+    pub part: Option<Part>,
+    /// What led to its round.
+    pub field: Option<Field>,
 }
 
-/// One block's part in a round.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Summary {
-    /// Whose.
-    pub block: BlockId,
-    /// It has a node that is held, and cannot move.
-    pub held: bool,
-    /// All its neighbours: the round is complete when each has said its part.
-    pub neighbours: Vec<BlockId>,
-    /// To those of a larger number.
-    pub links: Vec<Link>,
-    /// Largest squared error of a doubted measurement that it decides on.
-    pub largest_squared: f64,
-}
-
-impl Summary {
-    /// A block's part, from where its nodes and its neighbours' are. `None` while some have not found their place.
-    pub(super) fn new(
-        block: &Block,
-        poses: &BTreeMap<NodeId, Pose>,
-        known: &BTreeMap<NodeId, Pose>,
-        weights: &[f64],
-        largest_squared: f64,
-    ) -> Option<Self> {
-        let neighbours: BTreeSet<BlockId> = block.neighbours.values().copied().collect();
-        let mut links: BTreeMap<BlockId, (Tangent, Matrix6)> = BTreeMap::new();
-        for (edge, weight) in block.edges.iter().zip(weights) {
-            let c = &edge.constraint;
-            let (from, to) = (c.from as NodeId, c.to as NodeId);
-            let pose = |node: &NodeId| poses.get(node).or_else(|| known.get(node));
-            let (from_pose, to_pose) = (pose(&from)?, pose(&to)?);
-            let across = block.neighbours.get(&from).or_else(|| block.neighbours.get(&to));
-            let Some(other) = across.filter(|other| **other > block.id) else { continue };
-            let at = linearise(from_pose, to_pose, &c.from_from_to);
-            // Only how the two blocks move apart matters.
-            let towards_other = at.wrt_j * se3::adjoint(&to_pose.inverse());
-            let sign = if block.neighbours.contains_key(&to) { 1.0 } else { -1.0 };
-            let weighted = towards_other.transpose() * c.information * *weight;
-            let (gradient, hessian) =
-                links.entry(*other).or_insert_with(|| (Tangent::zeros(), Matrix6::zeros()));
-            *gradient += weighted * at.error * sign;
-            *hessian += weighted * towards_other;
-        }
-        let link = |(other, (gradient, hessian))| Link { other, gradient, hessian };
-        Some(Summary {
-            block: block.id,
-            held: !block.fixed.is_empty(),
-            neighbours: neighbours.into_iter().collect(),
-            links: links.into_iter().map(link).collect(),
-            largest_squared,
-        })
-    }
-
-    /// Size as plain numbers: 4 bytes a block, 8 each of a link's 6 + 21 numbers and of the error.
+impl News {
+    /// Size as plain numbers.
     pub fn bytes(&self) -> usize {
-        4 + 1 + 8 + 4 + 4 * self.neighbours.len() + 4 + self.links.len() * (4 + 27 * 8)
-    }
-
-    fn is_sound(&self) -> bool {
-        let finite = |x: &f64| x.abs() <= MOST;
-        finite(&self.largest_squared)
-            && self.links.iter().all(|l| l.gradient.iter().all(finite) && l.hessian.iter().all(finite))
+        let part = self.part.as_ref().map_or(0, Part::bytes);
+        8 + 8 + 1 + 4 + 4 + 1 + 8 + 1 + part + 1 + self.field.as_ref().map_or(0, Field::bytes)
     }
 }
 
-/// Rounds as one agent sees them.
-#[derive(Default)]
+/// A neighbour, as it was last heard.
+#[derive(Clone, Debug, Default)]
+struct Peer {
+    /// Its round and edition.
+    at: (u64, u64),
+    begun: bool,
+    below: bool,
+    /// Edition of ours that it has taken.
+    heard: u64,
+    /// Its part in our next round, and that part's edition.
+    part: Option<(u64, Part)>,
+    /// Our round and edition when it was last told of them, and the steps since.
+    told: (u64, u64),
+    since: u32,
+}
+
+/// Rounds as one block sees them.
 pub(super) struct Coarse {
     /// Rounds that have moved this block.
     pub round: u64,
-    /// The summaries that led to this round: neighbours may still need them.
-    last: BTreeMap<BlockId, Summary>,
-    /// Those known of the next one.
-    next: BTreeMap<BlockId, Summary>,
-    /// How this round has moved every block.
-    moves: BTreeMap<BlockId, Pose>,
+    edition: u64,
+    most_points: usize,
+    root: BlockId,
+    depth: u32,
+    /// The next one on the way to the root.
+    parent: Option<BlockId>,
+    peers: BTreeMap<BlockId, Peer>,
+    /// Of the next round.
+    grid: Grid,
+    own: Option<Part>,
+    /// With those of all below, and the edition that it came with.
+    sum: Option<(u64, Part)>,
+    /// What led to this round, over the grid that it had.
+    last: Option<(Grid, Field)>,
 }
 
 impl Coarse {
-    /// Takes a summary that leads to round `towards`.
-    pub fn take(&mut self, towards: u64, summary: &Summary) {
-        if towards == self.round + 1 && summary.is_sound() {
-            self.next.entry(summary.block).or_insert_with(|| summary.clone());
+    /// Before the first round.
+    pub fn new(own: BlockId, neighbours: impl Iterator<Item = BlockId>, most_points: usize) -> Self {
+        Coarse {
+            round: 0,
+            edition: 1,
+            most_points,
+            root: own,
+            depth: 0,
+            parent: None,
+            peers: neighbours.map(|id| (id, Peer::default())).collect(),
+            grid: Grid::default(),
+            own: None,
+            sum: None,
+            last: None,
         }
     }
 
-    /// The blocks whose part in the next round is known.
-    pub fn have(&self) -> impl Iterator<Item = BlockId> + '_ {
-        self.next.keys().copied()
+    /// The grid of the next round.
+    pub fn grid(&self) -> &Grid {
+        &self.grid
     }
 
-    /// True if this block's part in the next round is known.
-    pub fn has(&self, block: BlockId) -> bool {
-        self.next.contains_key(&block)
+    /// True if this block has said its part in the next round.
+    pub fn has_said(&self) -> bool {
+        self.own.is_some()
     }
 
-    /// True if someone has begun the next round.
+    /// True if this block or a neighbour has.
     pub fn has_begun(&self) -> bool {
-        !self.next.is_empty()
+        self.has_said() || self.peers.values().any(|p| p.begun && p.at.0 == self.round)
     }
 
-    /// What a neighbour at `round` lacks, and to which round it leads.
-    pub fn lacking(&self, round: u64, have: &BTreeSet<BlockId>) -> (u64, Vec<Summary>) {
-        let (towards, all) = match self.round {
-            now if round == now => (now + 1, &self.next),
-            now if round + 1 == now => (now, &self.last),
-            _ => return (0, Vec::new()),
+    /// Says this block's own part in the next round.
+    pub fn say(&mut self, part: Part) {
+        self.own = Some(part);
+        self.edition += 1;
+    }
+
+    /// Takes what a neighbour tells. True if that moves this block.
+    pub fn take(&mut self, from: BlockId, news: &News) -> bool {
+        let Some(peer) = self.peers.get_mut(&from) else { return false };
+        if peer.at <= (news.round, news.edition) {
+            peer.at = (news.round, news.edition);
+            (peer.begun, peer.heard) = (news.begun, news.heard);
+            if peer.below != news.below {
+                peer.below = news.below;
+                self.sum = None;
+            }
+            if !news.below && peer.part.take().is_some() {
+                self.sum = None;
+            }
+            if (news.root, news.depth.saturating_add(1)) < (self.root, self.depth) {
+                (self.root, self.depth, self.parent) = (news.root, news.depth.saturating_add(1), Some(from));
+                self.edition += 1;
+            }
+        }
+        let newer = peer.part.as_ref().is_none_or(|(edition, _)| *edition < news.edition);
+        if let Some(part) = news.part.as_ref().filter(|p| p.is_sound())
+            && peer.below
+            && newer
+            && news.round == self.round
+        {
+            peer.part = Some((news.edition, part.clone()));
+            self.sum = None;
+        }
+        match &news.field {
+            Some(field)
+                if news.round == self.round + 1
+                    && field.motions.len() == self.grid.len()
+                    && field.is_sound() =>
+            {
+                self.follow(field.clone());
+                true
+            }
+            _ => false,
+        }
+    }
+
+    /// Sums up what is there. True if that is the whole, and moves this block.
+    pub fn collect(&mut self) -> bool {
+        let below = || self.peers.values().filter(|p| p.below);
+        let (Some(own), None) = (&self.own, &self.sum) else { return false };
+        if !below().all(|p| p.part.is_some()) {
+            return false;
+        }
+        let Some(sum) = own.sum(below().filter_map(|p| Some(&p.part.as_ref()?.1))) else { return false };
+        if self.parent.is_none() && sum.open.is_empty() {
+            self.follow(sum.field(&self.grid, self.most_points));
+            return true;
+        }
+        self.edition += 1;
+        self.sum = Some((self.edition, sum));
+        false
+    }
+
+    /// What a neighbour is to be told, and whether that alone is worth a message; what it has not acknowledged is said
+    /// `again` from time to time.
+    pub fn tell(&mut self, to: BlockId, again: bool) -> (News, bool) {
+        let mut news = News {
+            round: self.round,
+            edition: self.edition,
+            begun: self.own.is_some(),
+            root: self.root,
+            depth: self.depth,
+            below: self.parent == Some(to),
+            ..News::default()
         };
-        (towards, all.values().filter(|s| !have.contains(&s.block)).cloned().collect())
+        let Some(peer) = self.peers.get_mut(&to) else { return (news, false) };
+        news.heard = peer.part.as_ref().map_or(0, |(edition, _)| *edition);
+        peer.since = peer.since.saturating_add(1);
+        let left_behind = peer.below && peer.at.0 < self.round;
+        let waits = peer.since >= REPEAT && (left_behind || news.begun);
+        let due = peer.told != (self.round, self.edition) || waits && again;
+        if due {
+            peer.told = (self.round, self.edition);
+            peer.since = 0;
+            if left_behind {
+                news.field = self.last.as_ref().map(|(_, field)| field.clone());
+            }
+            let lacking = self.sum.as_ref().filter(|(edition, _)| news.below && peer.heard < *edition);
+            news.part = lacking.map(|(_, part)| part.clone());
+        }
+        (news, due)
+    }
+
+    fn follow(&mut self, field: Field) {
+        self.last = Some((self.grid, field.clone()));
+        self.grid = field.next;
+        self.round += 1;
+        self.edition += 1;
+        (self.own, self.sum) = (None, None);
+        self.peers.values_mut().for_each(|p| p.part = None);
+    }
+
+    /// Where the newest round has moved a pose to.
+    pub fn moved(&self, pose: &Pose) -> Pose {
+        self.last.as_ref().map_or(*pose, |(grid, field)| grid.moved(&field.motions, pose))
     }
 
     /// Largest squared error of a doubted measurement, of all blocks, before the newest round.
     pub fn largest_squared(&self) -> f64 {
-        self.last.values().map(|s| s.largest_squared).fold(0.0, f64::max)
+        self.last.as_ref().map_or(0.0, |(_, field)| field.largest_squared)
     }
-
-    /// How the newest round has moved a block.
-    pub fn moved(&self, block: BlockId) -> Pose {
-        self.moves.get(&block).copied().unwrap_or_default()
-    }
-
-    /// Goes to the next round if all have said their part. True if so.
-    pub fn advance(&mut self) -> bool {
-        let complete = |summary: &Summary| summary.neighbours.iter().all(|n| self.next.contains_key(n));
-        if self.next.is_empty() || !self.next.values().all(complete) {
-            return false;
-        }
-        self.last = std::mem::take(&mut self.next);
-        self.moves = moves(&self.last);
-        self.round += 1;
-        true
-    }
-}
-
-/// How every block moves: the minimum over rigid motions. None moves where that has no answer.
-fn moves(summaries: &BTreeMap<BlockId, Summary>) -> BTreeMap<BlockId, Pose> {
-    let free: Vec<BlockId> = summaries.values().filter(|s| !s.held).map(|s| s.block).collect();
-    let step = minimum(summaries, &free).unwrap_or_else(|| vec![Tangent::zeros(); free.len()]);
-    let farthest = step.iter().map(|s| s.fixed_rows::<3>(3).norm()).fold(0.0, f64::max);
-    let share = if farthest > MOST_RAD { MOST_RAD / farthest } else { 1.0 };
-    free.into_iter().zip(step).map(|(block, step)| (block, se3::exp(&(step * share)))).collect()
-}
-
-fn minimum(summaries: &BTreeMap<BlockId, Summary>, free: &[BlockId]) -> Option<Vec<Tangent>> {
-    let index = |block: BlockId| free.binary_search(&block).ok();
-    let links = || summaries.values().flat_map(|s| s.links.iter().map(move |l| (s.block, l)));
-    let pairs: Vec<(usize, usize)> = links().filter_map(|(a, l)| index(a).zip(index(l.other))).collect();
-    let mut system = BlockCholesky::<6>::new(free.len(), &pairs).ok()?;
-    let mut rhs = vec![0.0; 6 * free.len()];
-    for (block, link) in links() {
-        let ends = [(index(block), 1.0), (index(link.other), -1.0)];
-        for (k, sign) in ends.iter().filter_map(|(k, sign)| Some(((*k)?, sign))) {
-            system.add(system.slot(k, k)?, &link.hessian);
-            for axis in 0..6 {
-                rhs[6 * k + axis] += sign * link.gradient[axis];
-            }
-        }
-        if let (Some(a), Some(b)) = (ends[0].0, ends[1].0) {
-            system.add(system.slot(a, b)?, &-link.hessian);
-        }
-    }
-    let damping: Vec<f64> = system.diagonal().iter().map(|d| 1e-9 * d).collect();
-    system.add_to_diagonal(&damping);
-    system.factorise().ok()?;
-    system.solve_in_place(&mut rhs, 1);
-    let steps: Vec<Tangent> = rhs.chunks_exact(6).map(Tangent::from_column_slice).collect();
-    steps.iter().all(|s| s.iter().all(|x| x.is_finite())).then_some(steps)
 }

@@ -25,12 +25,19 @@ pub struct Block {
     pub id: BlockId,
     /// Its nodes, ascending.
     pub nodes: Vec<NodeId>,
-    /// Those of them that keep the pose they start with.
+    /// Those of them, and of the neighbours', that keep the pose they start with.
     pub fixed: Vec<NodeId>,
     /// Measurements with at least one end here.
     pub edges: Vec<BlockEdge>,
     /// The block of every node elsewhere that a measurement leads to.
     pub neighbours: BTreeMap<NodeId, BlockId>,
+}
+
+impl Block {
+    /// True for one of the block's own nodes, false for its neighbours'.
+    pub(super) fn owns(&self, node: &NodeId) -> bool {
+        !self.neighbours.contains_key(node)
+    }
 }
 
 /// Cuts a problem into `count` blocks of consecutive nodes of nearly equal size. `doubted` is one per constraint.
@@ -69,6 +76,12 @@ pub fn blocks_of(
             other.neighbours.insert(constraint.from as NodeId, from);
             other.edges.push(edge.clone());
             blocks[from as usize].neighbours.insert(constraint.to as NodeId, to);
+            for (block, beyond) in [(to, constraint.from), (from, constraint.to)] {
+                let fixed = &mut blocks[block as usize].fixed;
+                if problem.fixed[beyond] && !fixed.contains(&(beyond as NodeId)) {
+                    fixed.push(beyond as NodeId);
+                }
+            }
         }
         blocks[from as usize].edges.push(edge);
     }

@@ -25,7 +25,7 @@ impl Local {
         weights: &[f64],
     ) -> Result<Option<Self>, SolveError> {
         let ends = |c: &Constraint| [c.from as NodeId, c.to as NodeId];
-        let own = |node: &NodeId| !block.neighbours.contains_key(node);
+        let own = |node: &NodeId| block.owns(node);
         let mut neighbours: BTreeMap<NodeId, Vec<NodeId>> = BTreeMap::new();
         for (edge, _) in block.edges.iter().zip(weights).filter(|(_, w)| **w > 0.0) {
             let [from, to] = ends(&edge.constraint);
@@ -33,7 +33,7 @@ impl Local {
             neighbours.entry(to).or_default().push(from);
         }
         let mut reached: BTreeMap<NodeId, bool> = known.keys().map(|node| (*node, false)).collect();
-        reached.extend(block.fixed.iter().map(|node| (*node, false)));
+        reached.extend(block.fixed.iter().filter(|n| own(n)).map(|node| (*node, false)));
         let mut open: Vec<NodeId> = reached.keys().copied().collect();
         while let Some(node) = open.pop() {
             for next in neighbours.get(&node).into_iter().flatten().filter(|n| own(n)) {
@@ -110,6 +110,22 @@ impl Local {
             }
         }
         Ok(())
+    }
+
+    /// Where the block's own nodes lie if they are placed anew, by the chordal relaxation with all others held. `None`
+    /// unless that costs less than where they are: then descent is caught in a minimum that is not the lowest.
+    pub fn placed_anew(
+        &self,
+        own: &BTreeMap<NodeId, Pose>,
+        known: &BTreeMap<NodeId, Pose>,
+        weights: &[f64],
+    ) -> Result<Option<BTreeMap<NodeId, Pose>>, SolveError> {
+        let here: Vec<Pose> = self.poses(own, known).iter().map(|p| p.unwrap_or_default()).collect();
+        let weights = self.weights(weights);
+        let found = chordal(self.solver.problem(), &here, &weights)?;
+        let better = self.solver.cost(&found, &weights) < self.solver.cost(&here, &weights);
+        let free = self.nodes.iter().zip(found).zip(&self.free).filter(|(_, free)| **free);
+        Ok(better.then(|| free.map(|(placed, _)| (*placed.0, placed.1)).collect()))
     }
 
     /// The minimum over the block's own nodes, from where they are.

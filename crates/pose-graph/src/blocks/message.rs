@@ -1,6 +1,6 @@
 //! What blocks tell each other.
 
-use super::coarse::Summary;
+use super::coarse::News;
 use super::{BlockId, NodeId};
 use coma_geometry::Pose;
 
@@ -17,21 +17,14 @@ pub struct Boundary {
     pub poses: Vec<(NodeId, Pose)>,
     /// Weights of the measurements between the two blocks that the sender decides on: index in the whole problem.
     pub weights: Vec<(u32, f64)>,
-    /// Coarse rounds that have moved the poses.
-    pub round: u64,
-    /// The blocks whose part in the next round the sender knows.
-    pub have: Vec<BlockId>,
-    /// The round that `summaries` lead to.
-    pub towards: u64,
-    /// What the reader is not known to have of them.
-    pub summaries: Vec<Summary>,
+    /// Of the rounds in which all move together; the poses are those of its round.
+    pub coarse: News,
 }
 
 impl Boundary {
     /// Size as plain numbers: 4 bytes a node, block or measurement, 8 a sequence, a weight, or one of a pose's 7 numbers.
     pub fn bytes(&self) -> usize {
-        let coarse =
-            8 + 4 + 4 * self.have.len() + 8 + 4 + self.summaries.iter().map(Summary::bytes).sum::<usize>();
-        4 + 8 + 8 + 4 + self.poses.len() * (4 + 7 * 8) + 4 + self.weights.len() * (4 + 8) + coarse
+        let poses = 4 + self.poses.len() * (4 + 7 * 8);
+        4 + 8 + 8 + poses + 4 + self.weights.len() * (4 + 8) + self.coarse.bytes()
     }
 }

@@ -7,7 +7,8 @@
 //!
 //! * [`cut`]: blocks of a problem.
 //! * [`agent`]: one agent's state machine: messages in, messages out.
-//! * [`coarse`]: whole blocks move, so that what is far apart need not wait for what lies between.
+//! * [`grid`], [`field`]: smooth motions of the whole map, so that what is far apart need not wait for what lies between.
+//!   [`coarse`]: the rounds in which all blocks come to move by one.
 //! * [`message`]: what they say. [`stillness`]: how they come to know that there is nothing left to say.
 //! * [`own`]: one agent's block of a graph that is known from log entries, with the trust that each loop deserves.
 //! * [`simulation`]: many agents in one process, over a network that loses and delays.
@@ -15,6 +16,8 @@
 pub mod agent;
 pub mod coarse;
 pub mod cut;
+pub mod field;
+pub mod grid;
 mod local;
 pub mod message;
 pub mod own;

@@ -130,8 +130,9 @@ impl OwnBlock {
                 None => {}
             }
         }
-        if own(gauge) {
-            block.fixed.push(node(gauge) as NodeId);
+        // Who has loops to the gauge knows that it stays.
+        if let Ok(gauge) = submaps.binary_search(gauge) {
+            block.fixed.push(gauge as NodeId);
         }
         for (index, (edge, trust)) in edges.iter().enumerate() {
             let constraint = Constraint {

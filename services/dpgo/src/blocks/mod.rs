@@ -14,6 +14,7 @@ mod driver;
 mod names;
 mod part;
 mod post;
+mod rounds;
 mod run;
 
 use crate::config::BlockConfig;

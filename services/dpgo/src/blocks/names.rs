@@ -1,7 +1,7 @@
 //! Names and numbers: agents, submaps and loops have names on the wire and numbers in a block.
 
-use coma_geometry::{AgentId, Matrix6, Pose, SubmapId, Tangent};
-use coma_pose_graph::blocks::coarse::{Link, Summary};
+use super::rounds;
+use coma_geometry::{AgentId, Pose, SubmapId};
 use coma_pose_graph::blocks::{BlockId, Boundary, NodeId, OwnBlock, Standing};
 use coma_pose_graph::{EdgeKey, EdgeKind};
 use coma_wire::entries::EntryKey;
@@ -10,8 +10,6 @@ use std::collections::BTreeMap;
 
 /// Poses and weights in one boundary.
 const MAX_BOUNDARY: usize = 65_536;
-/// Largest gradient and squared error.
-const MOST: f64 = 1e30;
 
 /// Who takes part in a solve, in the order of their numbers, and whose frame is the map's.
 pub struct Team {
@@ -48,12 +46,12 @@ impl Team {
         self.agents.get(block as usize).map_or_else(String::new, Wire::to_wire)
     }
 
-    fn read(&self, name: String, at: &At<'_>) -> Result<BlockId, FieldError> {
+    pub(super) fn read(&self, name: String, at: &At<'_>) -> Result<BlockId, FieldError> {
         let agent = AgentId::from_wire(name, at)?;
         self.number(&agent).ok_or_else(|| at.refuse(format!("{agent} takes no part in this solve")))
     }
 
-    fn read_all(&self, names: Vec<String>, at: &At<'_>) -> Result<Vec<BlockId>, FieldError> {
+    pub(super) fn read_all(&self, names: Vec<String>, at: &At<'_>) -> Result<Vec<BlockId>, FieldError> {
         at.at_most(names.len(), self.agents.len(), "agents")?;
         names.into_iter().enumerate().map(|(k, name)| self.read(name, &at.index(k))).collect()
     }
@@ -83,54 +81,6 @@ impl Team {
             })
         };
         standings.into_iter().enumerate().map(read).collect()
-    }
-
-    fn summary(&self, s: &Summary) -> v1::BlockSummary {
-        let link = |l: &Link| v1::BlockLink {
-            other: self.name(l.other),
-            gradient: l.gradient.iter().copied().collect(),
-            hessian: Some(l.hessian.to_wire()),
-        };
-        v1::BlockSummary {
-            agent_id: self.name(s.block),
-            held: s.held,
-            neighbours: s.neighbours.iter().map(|n| self.name(*n)).collect(),
-            links: s.links.iter().map(link).collect(),
-            largest_squared_error: s.largest_squared,
-        }
-    }
-
-    fn read_summary(&self, m: v1::BlockSummary, at: &At<'_>) -> Result<Summary, FieldError> {
-        let links_at = at.field("links");
-        links_at.at_most(m.links.len(), self.agents.len(), "links")?;
-        let read_link = |(k, l): (usize, v1::BlockLink)| {
-            let at = links_at.index(k);
-            let gradient_at = at.field("gradient");
-            if l.gradient.len() != 6 {
-                return Err(gradient_at.refuse(format!("{} numbers, 6 are needed", l.gradient.len())));
-            }
-            for (k, value) in l.gradient.iter().enumerate() {
-                within(*value, &gradient_at.index(k))?;
-            }
-            let hessian: Matrix6 = at.field("hessian").required(l.hessian)?;
-            let gradient = Tangent::from_column_slice(&l.gradient);
-            Ok(Link { other: self.read(l.other, &at.field("other"))?, gradient, hessian })
-        };
-        Ok(Summary {
-            block: self.read(m.agent_id, &at.field("agent_id"))?,
-            held: m.held,
-            neighbours: self.read_all(m.neighbours, &at.field("neighbours"))?,
-            links: m.links.into_iter().enumerate().map(read_link).collect::<Result<_, _>>()?,
-            largest_squared: within(m.largest_squared_error, &at.field("largest_squared_error"))?,
-        })
-    }
-}
-
-fn within(value: f64, at: &At<'_>) -> Result<f64, FieldError> {
-    if value.abs() <= MOST {
-        Ok(value)
-    } else {
-        Err(at.refuse(format!("{value} is not finite or over 1e30")))
     }
 }
 
@@ -169,10 +119,7 @@ impl Names {
             heard: b.heard,
             poses: b.poses.iter().filter_map(pose).collect(),
             weights: b.weights.iter().filter_map(weight).collect(),
-            round: b.round,
-            have: b.have.iter().map(|block| team.name(*block)).collect(),
-            towards: b.towards,
-            summaries: b.summaries.iter().map(|s| team.summary(s)).collect(),
+            ..rounds::written(&b.coarse, team)
         }
     }
 
@@ -180,10 +127,11 @@ impl Names {
     pub fn read_boundary(
         &self,
         from: BlockId,
-        m: v1::Boundary,
+        mut m: v1::Boundary,
         team: &Team,
         at: &At<'_>,
     ) -> Result<Boundary, FieldError> {
+        let coarse = rounds::read(&mut m, team, at)?;
         let poses_at = at.field("poses");
         poses_at.at_most(m.poses.len(), MAX_BOUNDARY, "poses")?;
         let mut poses = Vec::new();
@@ -207,21 +155,6 @@ impl Names {
             }
             weights.extend(self.loops.get(&crate::facts::edge_key(&verdict)).map(|index| (*index, weight)));
         }
-        let summaries_at = at.field("summaries");
-        summaries_at.at_most(m.summaries.len(), team.agents.len(), "summaries")?;
-        let summaries = m.summaries.into_iter().enumerate();
-        Ok(Boundary {
-            from,
-            sequence: m.sequence,
-            heard: m.heard,
-            poses,
-            weights,
-            round: m.round,
-            have: team.read_all(m.have, &at.field("have"))?,
-            towards: m.towards,
-            summaries: summaries
-                .map(|(k, s)| team.read_summary(s, &summaries_at.index(k)))
-                .collect::<Result<_, _>>()?,
-        })
+        Ok(Boundary { from, sequence: m.sequence, heard: m.heard, poses, weights, coarse })
     }
 }

@@ -6,8 +6,9 @@ use coma_geometry::{AgentId, Epoch, MapId, Matrix6, Pose, StampNs, SubmapId};
 use coma_runtime::{ByteLedger, Channel, Class, channel};
 use coma_wire::entries::*;
 use coma_wire::v1::dpgo_client::DpgoClient;
-use coma_wire::{At, Wire, encode_payload, v1};
+use coma_wire::{At, Wire, encode_payload, field_errors_of, v1};
 use std::collections::BTreeMap;
+use tonic::{Code, Status};
 
 pub type Client = DpgoClient<Channel>;
 
@@ -46,6 +47,16 @@ pub fn information() -> Matrix6 {
 impl Log {
     /// A log whose submaps are tied by exact odometry.
     pub fn walk(agent: &str, anchor_priority: u32, submaps: u32) -> Log {
+        Log::walk_with(agent, anchor_priority, submaps, Pose::identity)
+    }
+
+    /// The same with odometry that has errors.
+    pub fn walk_with(
+        agent: &str,
+        anchor_priority: u32,
+        submaps: u32,
+        mut error: impl FnMut() -> Pose,
+    ) -> Log {
         let mut log = Log { agent: AgentId::new(agent).unwrap(), entries: Vec::new() };
         log.write(Payload::AgentStarted(AgentStarted { anchor_priority, build: "test".into() }));
         for number in 0..submaps {
@@ -59,7 +70,7 @@ impl Log {
             }));
             if let Some(before) = number.checked_sub(1) {
                 let from = submap(agent, before);
-                let from_from_to = between(&from, &id);
+                let from_from_to = between(&from, &id) * error();
                 let odometry = OdometryEdge { from_from_to, from, to: id, information: information() };
                 log.write(Payload::OdometryEdge(odometry));
             }
@@ -131,6 +142,13 @@ pub async fn put(client: &mut Client, graph: &str, entries: Vec<v1::Entry>) -> V
 
 pub fn solve_request(graph: &str, at_least: v1::VersionVector) -> v1::SolveRequest {
     v1::SolveRequest { graph: graph.into(), at_least: Some(at_least) }
+}
+
+#[track_caller]
+pub fn assert_refused<T: std::fmt::Debug>(answer: Result<T, Status>, field: &str) {
+    let status = answer.expect_err(field);
+    assert_eq!(status.code(), Code::InvalidArgument, "{status}");
+    assert_eq!(field_errors_of(&status)[0].field, field, "{status}");
 }
 
 /// Puts whole logs and solves.
