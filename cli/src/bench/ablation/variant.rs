@@ -66,7 +66,7 @@ impl Variant {
             }
             Variant::UsualGrowth => {
                 "new where A < 0.98, or where the observation lies in front of the rendering by more than 50 \
-                 times the median depth error"
+                 times the median depth error; every pixel of the seed grid has a surfel of its own"
             }
             Variant::Unfused => "surfels stay where they were born, and submaps begin empty, as in the paper",
             Variant::Adam => "eq. 4 of the paper, in place of one rendering and Gauss-Newton",
@@ -84,7 +84,10 @@ impl Variant {
                 settings.mapping.seed.fit = Fit::Random;
                 settings.mapping.optimise.rotation_rate_rad = 0.02;
             }
-            Variant::UsualGrowth => settings.mapping.growth = GrowthRule::Usual,
+            Variant::UsualGrowth => {
+                settings.mapping.growth = GrowthRule::Usual;
+                settings.mapping.seed.even_color = 0.0;
+            }
             Variant::Unfused => {
                 settings.mapping.fuse.enabled = false;
                 settings.mapping.inherit.enabled = false;

@@ -26,7 +26,7 @@ pub struct InheritSettings {
 
 impl Default for InheritSettings {
     fn default() -> Self {
-        InheritSettings { enabled: true, margin: 0.1, relative: 0.02, min_size: 0.6, max_size: 1.5 }
+        InheritSettings { enabled: true, margin: 0.1, relative: 0.02, min_size: 0.6, max_size: 3.0 }
     }
 }
 
@@ -96,7 +96,7 @@ mod tests {
             ([1.1, 0.0, 2.0], 1.6, true),   // half a pixel beside the picture
             ([2.0, 0.0, 2.0], 1.6, false),  // far beside it
             ([0.0, 0.0, 2.0], 0.5, false),  // too fine
-            ([0.0, 0.0, 2.0], 4.0, false),  // too coarse
+            ([0.0, 0.0, 2.0], 6.0, false),  // too coarse
         ];
         let anchor_from_submap = Pose::translation(0.5, 0.0, 0.0);
         for (center_m, size_px, comes) in cases {

@@ -16,6 +16,9 @@ pub struct SeedSettings {
     /// Standard deviation of a surfel in units of the spacing; the paper takes 1 (eq. 6). At 0.8 neighbours
     /// still cover a surface to an opacity of 0.98 and blur it less.
     pub scale_in_spacings: f32,
+    /// Where four pixels of the grid that lie in a square are all new, see one plane, and their cells' mean colours differ
+    /// in no channel by more than this, 0..1, one surfel of twice the size stands for them. 0: every pixel has its own.
+    pub even_color: f32,
     /// Opacity at birth.
     pub opacity: f32,
     /// A surfel on an inclined surface is stretched along the incline so that its picture keeps its size, at
@@ -43,6 +46,7 @@ impl Default for SeedSettings {
         SeedSettings {
             spacing_px: 2,
             scale_in_spacings: 0.8,
+            even_color: 0.015,
             opacity: 0.95,
             max_stretch: 3.0,
             fit: Fit::Surface,
@@ -102,39 +106,117 @@ pub fn seed(
 ) -> Vec<Surfel> {
     let rotation = submap_from_camera.rotation.to_rotation_matrix().matrix().cast::<f32>();
     let translation: Vector3<f32> = submap_from_camera.translation.vector.cast();
+    let surfel = |(x, y): (usize, usize), size: f32, color: [f32; 3]| {
+        let (center, axes, fitted) = disc(frame, x, y, size, settings)?;
+        let submap_axes = Rotation3::from_matrix_unchecked(rotation * axes);
+        let (q, scale) = match settings.fit {
+            Fit::Surface => (UnitQuaternion::from_rotation_matrix(&submap_axes), fitted),
+            Fit::Random => (
+                random_rotation(settings.random_seed, frame.sequence, x, y),
+                [0.5 * (fitted[0] + fitted[1]); 2],
+            ),
+        };
+        Some(Surfel {
+            center_m: (rotation * center + translation).into(),
+            rotation_wxyz: [q.w, q.i, q.j, q.k],
+            scale_m: scale,
+            opacity: settings.opacity,
+            color,
+        })
+    };
     let mut out = Vec::new();
-    for j in 0..wanted.height() {
-        for i in 0..wanted.width() {
-            if !wanted[(i, j)] {
+    for (j, i) in
+        (0..wanted.height()).step_by(2).flat_map(|j| (0..wanted.width()).step_by(2).map(move |i| (j, i)))
+    {
+        let square = [(i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)];
+        if let Some(color) = even_color(frame, settings, grid, wanted, &square, &color_at) {
+            let between = grid.pixel(i, j);
+            let center = (between.0 + grid.spacing / 2, between.1 + grid.spacing / 2);
+            if let Some(one) = surfel(center, 2.0, color) {
+                out.push(one);
                 continue;
             }
-            let (x, y) = grid.pixel(i, j);
-            let Some((center, axes, fitted)) = disc(frame, x, y, settings) else { continue };
-            let submap_axes = Rotation3::from_matrix_unchecked(rotation * axes);
-            let (q, scale) = match settings.fit {
-                Fit::Surface => (UnitQuaternion::from_rotation_matrix(&submap_axes), fitted),
-                Fit::Random => (
-                    random_rotation(settings.random_seed, frame.sequence, x, y),
-                    [0.5 * (fitted[0] + fitted[1]); 2],
-                ),
-            };
-            out.push(Surfel {
-                center_m: (rotation * center + translation).into(),
-                rotation_wxyz: [q.w, q.i, q.j, q.k],
-                scale_m: scale,
-                opacity: settings.opacity,
-                color: color_at(x, y),
-            });
+        }
+        let inside = square.iter().filter(|(i, j)| *i < wanted.width() && *j < wanted.height());
+        for (i, j) in inside.filter(|at| wanted[**at]) {
+            let (x, y) = grid.pixel(*i, *j);
+            out.extend(surfel((x, y), 1.0, color_at(x, y)));
         }
     }
     out
 }
 
-/// Centre, axes `(e1, e2, n)` and scales of a pixel's disc, in the camera.
+/// Mean colour of four pixels of the grid, if they are all wanted, lie in one plane and look alike.
+fn even_color(
+    frame: &RgbdFrame,
+    settings: &SeedSettings,
+    grid: &SeedGrid,
+    wanted: &Image<bool>,
+    square: &[(usize, usize); 4],
+    color_at: impl Fn(usize, usize) -> [f32; 3],
+) -> Option<[f32; 3]> {
+    let (last_i, last_j) = square[3];
+    // The last cells may reach beyond the picture.
+    let inside = last_i + 1 < wanted.width() && last_j + 1 < wanted.height() && settings.even_color > 0.0;
+    if !inside || !square.iter().all(|at| wanted[*at]) {
+        return None;
+    }
+    let colors = square.map(|(i, j)| cell_color(grid, i, j, &color_at));
+    let even = |channel: usize| {
+        let values = colors.map(|c| c[channel]);
+        let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
+        high - low <= settings.even_color
+    };
+    let (x, y) = grid.pixel(square[0].0, square[0].1);
+    let reach = grid.spacing.div_ceil(2);
+    let plane = lies_in_plane(frame, x + grid.spacing / 2, y + grid.spacing / 2, reach + grid.spacing / 2);
+    ((0..3).all(even) && plane)
+        .then(|| std::array::from_fn(|channel| 0.25 * colors.iter().map(|c| c[channel]).sum::<f32>()))
+}
+
+/// Mean colour of the pixels that a pixel of the grid stands for.
+fn cell_color(grid: &SeedGrid, i: usize, j: usize, color_at: impl Fn(usize, usize) -> [f32; 3]) -> [f32; 3] {
+    let (x, y) = (grid.spacing * i, grid.spacing * j);
+    let cell = (0..grid.spacing).flat_map(|v| (0..grid.spacing).map(move |u| (x + u, y + v)));
+    let sum = cell.fold([0.0f32; 3], |sum, (u, v)| {
+        let color = color_at(u, v);
+        std::array::from_fn(|channel| sum[channel] + color[channel])
+    });
+    sum.map(|s| s / (grid.spacing * grid.spacing) as f32)
+}
+
+/// True if depth around a pixel is that of a plane, as far as noise lets one say. The inverse depth of a plane is linear
+/// over the picture.
+fn lies_in_plane(frame: &RgbdFrame, x: usize, y: usize, reach: usize) -> bool {
+    let (width, height) = (frame.depth_m.width(), frame.depth_m.height());
+    if x < reach || y < reach || x + reach >= width || y + reach >= height {
+        return false;
+    }
+    let inverse = |x: usize, y: usize| Some(frame.depth_m[(x, y)]).filter(|z| *z > 0.0).map(|z| 1.0 / z);
+    let Some(here) = inverse(x, y) else { return false };
+    // Of a sum with weights 1, -2, 1.
+    let sigma = 2.45 * frame.noise.sigma_m(1.0 / here) * here * here;
+    let ends = [
+        ((x - reach, y), (x + reach, y)),
+        ((x, y - reach), (x, y + reach)),
+        ((x - reach, y - reach), (x + reach, y + reach)),
+        ((x - reach, y + reach), (x + reach, y - reach)),
+    ];
+    ends.iter().all(|(a, b)| match (inverse(a.0, a.1), inverse(b.0, b.1)) {
+        (Some(a), Some(b)) => (a + b - 2.0 * here).abs() <= PLANE_SIGMA * sigma,
+        _ => false,
+    })
+}
+
+/// Depth that bends by less than so many standard deviations is that of a plane.
+const PLANE_SIGMA: f32 = 2.0;
+
+/// Centre, axes `(e1, e2, n)` and scales of a disc, in the camera: `size` times that of a pixel of the grid.
 fn disc(
     frame: &RgbdFrame,
     x: usize,
     y: usize,
+    size: f32,
     settings: &SeedSettings,
 ) -> Option<(Vector3<f32>, Matrix3<f32>, [f32; 2])> {
     let z = frame.depth_m[(x, y)];
@@ -147,7 +229,7 @@ fn disc(
     let e1 = if incline.norm() > 1e-3 { incline.normalize() } else { n.cross(&Vector3::y()).normalize() };
     let e2 = n.cross(&e1);
     // eq. (6): s = (D / fx, D / fy), times the seed spacing.
-    let spread = settings.spacing_px.max(1) as f32 * settings.scale_in_spacings;
+    let spread = size * settings.spacing_px.max(1) as f32 * settings.scale_in_spacings;
     let base = spread * z * (0.5 / frame.camera.fx + 0.5 / frame.camera.fy) as f32;
     let stretch = (1.0 / cos.max(1e-3)).clamp(1.0, settings.max_stretch.max(1.0));
     Some((ray * z, Matrix3::from_columns(&[e1, e2, n]), [base * stretch, base]))
@@ -170,7 +252,7 @@ mod tests {
     fn surfels_lie_on_the_surface_and_face_the_camera() {
         let frame = wall();
         let pose = Pose::translation(1.0, 0.0, 0.0);
-        let settings = SeedSettings::default();
+        let settings = SeedSettings { even_color: 0.0, ..SeedSettings::default() };
         let grid = SeedGrid::of(&frame.camera, &settings);
         let all = Image::filled(16, 12, true);
         let surfels = seed(&frame, &pose, &settings, &grid, &all, |_, _| [1.0, 0.5, 0.2]);
@@ -232,5 +314,47 @@ mod tests {
             }
             assert!(grid.pixel(last.0 + 1, 0).0 >= 33 && grid.pixel(0, last.1 + 1).1 >= 24);
         }
+    }
+
+    #[test]
+    fn what_is_even_is_made_of_larger_surfels_and_what_is_not_of_small_ones() {
+        let even = SeedSettings::default();
+        let size_px = |s: &Surfel| s.scale_m[1] / s.center_m[2] * 30.0 / 1.6;
+        let sizes = |frame: &RgbdFrame| -> Vec<f32> {
+            let grid = SeedGrid::of(&frame.camera, &even);
+            let wanted = grid.pick(&frame.depth_m).map(|z| *z > 0.0);
+            let color = |x, y| frame.color[(x, y)].map(|v| v as f32 / 255.0);
+            seed(frame, &Pose::identity(), &even, &grid, &wanted, color).iter().map(size_px).collect()
+        };
+        let share = |frame: &RgbdFrame| {
+            let sizes = sizes(frame);
+            sizes.iter().filter(|size| (**size - 2.0).abs() < 1e-3).count() as f32 / sizes.len() as f32
+        };
+        let plain = wall();
+        assert!(share(&plain) > 0.6, "{}", share(&plain));
+        // Every other cell is brighter by more than is even.
+        let checked = Image::from_fn(32, 24, |x, y| [200 + (((x / 2 + y / 2) % 2) * 8) as u8, 100, 50]);
+        let checked =
+            RgbdFrame::new(0, StampNs(0), plain.camera, plain.noise, checked, plain.depth_m.clone()).unwrap();
+        assert_eq!(share(&checked), 0.0);
+        // A pipe of 0.2 m.
+        let bent = Image::from_fn(32, 24, |x, _| {
+            let across = (x as f32 - 15.5) / 30.0 * 2.0;
+            2.0 - (0.04 - across * across).max(0.0).sqrt()
+        });
+        let bent = RgbdFrame::new(
+            0,
+            StampNs(0),
+            plain.camera,
+            DepthNoise { base_m: 1e-4, quadratic_per_m: 0.0 },
+            plain.color.clone(),
+            bent,
+        );
+        let bent = bent.unwrap();
+        let grid = SeedGrid::of(&bent.camera, &even);
+        let color = |x, y| bent.color[(x, y)].map(|v| v as f32 / 255.0);
+        let on_pipe = Image::from_fn(16, 12, |i, _| (6..10).contains(&i));
+        let found = seed(&bent, &Pose::identity(), &even, &grid, &on_pipe, color);
+        assert!(!found.is_empty() && found.iter().all(|s| (size_px(s) - 1.0).abs() < 1e-3));
     }
 }

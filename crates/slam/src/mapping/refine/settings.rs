@@ -84,7 +84,7 @@ impl Default for RefineSettings {
             low_pass_px: 0.3,
             prune_opacity: 0.05,
             hole_opacity: 0.7,
-            seed_holes: SeedSettings { spacing_px: 1, ..SeedSettings::default() },
+            seed_holes: SeedSettings { spacing_px: 1, even_color: 0.0, ..SeedSettings::default() },
             max_surfels: 800_000,
             poses: false,
             poses_from_step: 200,
