@@ -172,6 +172,8 @@ impl Bound {
             }
         }
         let tls = settings.tls.as_ref().map(ServerTls::config).transpose()?;
+        // Before there is anything to count.
+        crate::metrics::install();
         let bind = |source| ServeError::Bind { listen, source };
         let listener = TcpListener::bind(listen).await.map_err(bind)?;
         let local_addr = listener.local_addr().map_err(bind)?;
@@ -199,8 +201,8 @@ impl Bound {
         self.stop.clone()
     }
 
-    /// Serves, with health and reflection (`descriptor_set` is the encoded contract), until the handle is
-    /// shut down or dropped. From outside in: byte counts, authorization, admission with load shedding,
+    /// Serves, with health, reflection (`descriptor_set` is the encoded contract) and the process's metrics under
+    /// `GET /metrics`, until the handle is shut down or dropped. From outside in: byte counts, authorization, admission with load shedding,
     /// deadline.
     pub async fn serve(
         self,
@@ -223,6 +225,8 @@ impl Bound {
         routes.add_service(reflection);
 
         let mut server = transport::Server::builder()
+            // For GET /metrics.
+            .accept_http1(true)
             .http2_keepalive_interval(Some(Duration::from_secs(20)))
             .http2_keepalive_timeout(Some(Duration::from_secs(20)))
             .http2_max_header_list_size(Some(16 << 10))
@@ -279,6 +283,7 @@ where
     let stack = ServiceBuilder::new()
         .layer(around(metered as fn(_, _) -> _))
         .layer(around(move |request, next| authorized(policy.clone(), request, next)))
+        .layer(around(measured as fn(_, _) -> _))
         .layer(around(move |request, next| admitted(places.clone(), limit, request, next)))
         .layer(around(move |request, next| in_time(longest, request, next)));
     tower::layer::layer_fn(move |inner: S| StackService::new(stack.service(inner)))
@@ -302,9 +307,30 @@ async fn authorized(policy: Arc<Policy>, request: Request, next: Next) -> Respon
         Err(status) => {
             let from = Connection::of_http(&request).map(|c| c.remote_addr());
             tracing::warn!(path = request.uri().path(), ?from, reason = status.message(), "refused a call");
-            status.into_http()
+            match request.uri().path() {
+                METRICS => text(http::StatusCode::UNAUTHORIZED, status.message().to_owned()),
+                _ => status.into_http(),
+            }
         }
     }
+}
+
+/// Where a server answers plain HTTP, with its process's metrics in Prometheus' text format.
+const METRICS: &str = "/metrics";
+
+async fn measured(request: Request, next: Next) -> Response {
+    match request.uri().path() {
+        METRICS => text(http::StatusCode::OK, crate::metrics::render()),
+        _ => pass(next, request).await,
+    }
+}
+
+fn text(status: http::StatusCode, text: String) -> Response {
+    let mut response = http::Response::new(tonic::body::Body::new(text));
+    *response.status_mut() = status;
+    let plain = http::HeaderValue::from_static("text/plain; version=0.0.4; charset=utf-8");
+    response.headers_mut().insert(http::header::CONTENT_TYPE, plain);
+    response
 }
 
 async fn admitted(places: Arc<Semaphore>, limit: usize, request: Request, next: Next) -> Response {

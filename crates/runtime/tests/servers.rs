@@ -162,3 +162,33 @@ fn an_endpoint_that_is_no_url_is_refused_by_name() {
         assert!(made.unwrap_err().to_string().contains(&format!("{bad:?}")), "{bad:?}");
     }
 }
+
+/// The answer to a plain HTTP/1.1 request.
+async fn get(url: &str, path: &str, token: Option<&str>) -> String {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let host = url.strip_prefix("http://").unwrap();
+    let mut stream = tokio::net::TcpStream::connect(host).await.unwrap();
+    let token = token.map(|token| format!("authorization: Bearer {token}\r\n")).unwrap_or_default();
+    let request = format!("GET {path} HTTP/1.1\r\nhost: {host}\r\nconnection: close\r\n{token}\r\n");
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).await.unwrap();
+    answer
+}
+
+#[tokio::test]
+async fn metrics_are_told_over_plain_http_behind_the_same_token() {
+    coma_runtime::metrics::install();
+    metrics::counter!("coma_server_test_total").increment(5);
+    let (_server, url) = serve(&ServerSettings::default(), &ByteLedger::default()).await;
+    let answer = get(&url, "/metrics", None).await;
+    assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("coma_server_test_total 5"), "{answer}");
+
+    let settings = ServerSettings { token: Some(Secret::new("right")), ..Default::default() };
+    let (_server, url) = serve(&settings, &ByteLedger::default()).await;
+    for token in [None, Some("wrong")] {
+        let answer = get(&url, "/metrics", token).await;
+        assert!(answer.starts_with("HTTP/1.1 401") && !answer.contains("coma_server_test_total"), "{answer}");
+    }
+    assert!(get(&url, "/metrics", Some("right")).await.contains("coma_server_test_total 5"));
+}
