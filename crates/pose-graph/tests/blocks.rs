@@ -157,6 +157,35 @@ fn the_same_seed_gives_the_same_bits_and_agents_fall_silent() {
     assert!(run(1).1 != run(2).1);
 }
 
+/// The root of a round goes on, and its neighbour hears nothing of it for longer than anyone waits.
+#[test]
+fn a_block_that_was_left_behind_by_a_round_follows_once_it_hears_again() {
+    let (problem, truth) = ladder(12, 5);
+    let weights = vec![1.0; problem.constraints.len()];
+    let cut = blocks(&problem, &weights, &vec![false; weights.len()], 2);
+    let agents = cut.into_iter().map(|b| BlockAgent::new(b, |n| truth[n as usize], BlockSettings::default()));
+    let [mut root, mut below]: [BlockAgent; 2] = agents.collect::<Vec<_>>().try_into().ok().unwrap();
+    let (mut lost, mut settled) = (0, false);
+    for _ in 0..3000 {
+        for (_, message) in root.step().unwrap() {
+            if root.coarse_rounds() > below.coarse_rounds() && lost < 300 {
+                lost += 1;
+            } else {
+                below.receive(&message);
+            }
+        }
+        for (_, message) in below.step().unwrap() {
+            root.receive(&message);
+        }
+        settled = root.is_settled() && below.is_settled();
+        if settled && lost > 0 {
+            break;
+        }
+    }
+    assert!(lost >= 300, "a round was lost, {lost} messages");
+    assert!(settled && root.coarse_rounds() == below.coarse_rounds());
+}
+
 #[test]
 fn false_loops_get_the_weights_that_they_have_centrally() {
     for seed in 0..5 {

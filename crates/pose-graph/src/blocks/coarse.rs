@@ -193,8 +193,9 @@ impl Coarse {
         news.heard = peer.part.as_ref().map_or(0, |(edition, _)| *edition);
         peer.since = peer.since.saturating_add(1);
         let left_behind = peer.below && peer.at.0 < self.round;
-        let waits = peer.since >= REPEAT && (left_behind || news.begun);
-        let due = peer.told != (self.round, self.edition) || waits && again;
+        // One that is left behind takes no poses until it has followed: it is told for as long as it takes.
+        let waits = peer.since >= REPEAT && (left_behind || news.begun && again);
+        let due = peer.told != (self.round, self.edition) || waits;
         if due {
             peer.told = (self.round, self.edition);
             peer.since = 0;
