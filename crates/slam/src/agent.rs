@@ -23,6 +23,7 @@ use coma_geometry::{AgentId, Epoch, Matrix6, Pose, StampNs, SubmapId};
 use coma_raster::RenderSettings;
 use coma_surfel::SurfelCloud;
 use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
 use std::sync::Arc;
 
 /// Everything that can be set about one agent's tracking and mapping.
@@ -125,7 +126,7 @@ pub struct Recent {
     pub id: SubmapId,
     /// Its chain.
     pub chain: u32,
-    /// Its surfels.
+    /// Its surfels, without those that the next submap took over.
     pub surfels: Arc<SurfelCloud>,
     /// As it was measured, one for each surfel; without it that of their colour.
     pub intensity: Option<Vec<f32>>,
@@ -154,7 +155,8 @@ pub struct Agent {
     next_submap: u32,
     next_chain: u32,
     active: Option<ActiveSubmap>,
-    recent: Option<Recent>,
+    /// The chain's last closed submaps, oldest first.
+    closed: VecDeque<Recent>,
     previous: Option<Previous>,
     brightness: Brightness,
     last_pose: Pose,
@@ -182,7 +184,7 @@ impl Agent {
             next_submap,
             next_chain,
             active: None,
-            recent,
+            closed: recent.into_iter().collect(),
             previous: None,
             brightness: Brightness::default(),
             last_pose,
@@ -211,7 +213,7 @@ impl Agent {
             return Located::Lost(vec![Reason::LittleDepth { share: share * 100.0, needed }]);
         }
         let view = TrackingView::from_frame(frame, levels);
-        match (&self.active, &self.recent) {
+        match (&self.active, self.closed.back()) {
             (None, None) => Located::Nowhere(view),
             (None, Some(_)) => match self.relocate(&view) {
                 Some(tracked) => Located::Tracked(view, tracked),
@@ -245,8 +247,8 @@ impl Agent {
     /// Closes the submap under work: the stream has ended.
     pub fn finish(&mut self) -> Vec<Event> {
         self.previous = None;
-        let events = self.close_active().into_iter().collect();
-        self.recent = None;
+        let events = self.close_active(&[]).into_iter().collect();
+        self.closed.clear();
         events
     }
 
@@ -264,7 +266,7 @@ impl Agent {
     }
 
     fn model(&self) -> Model<'_> {
-        let recent = self.recent.iter().map(|r| Part {
+        let closed = self.closed.iter().map(|r| Part {
             surfels: &r.surfels,
             intensity: r.intensity.as_deref(),
             agent_from_submap: r.agent_from_submap,
@@ -274,7 +276,7 @@ impl Agent {
             intensity: Some(&a.measured.intensity),
             agent_from_submap: a.agent_from_submap,
         });
-        Model { submaps: recent.chain(active).collect(), render: &self.settings.render }
+        Model { submaps: closed.chain(active).collect(), render: &self.settings.render }
     }
 
     /// A first submap, or the first after the camera was lost: its chain is tied to nothing yet.
@@ -294,7 +296,7 @@ impl Agent {
             hits: 0,
         };
         self.previous = None;
-        self.recent = None;
+        self.closed.clear();
         let chain = self.next_chain;
         self.next_chain += 1;
         let (_, opened) = self.open_submap(&frame, chain, self.last_pose, Inheritance::default());
@@ -319,7 +321,7 @@ impl Agent {
         if let Some(full) = full {
             let submap_from_anchor = full.agent_from_submap.inv_mul(&tracked.agent_from_camera);
             inherited = full.bequeath(&submap_from_anchor, &view, &self.settings.mapping);
-            events.extend(self.close_active());
+            events.extend(self.close_active(&inherited.taken));
         }
         if self.active.is_none() {
             events.extend(self.follow_recent(&frame, &tracked, inherited));
@@ -380,7 +382,7 @@ impl Agent {
                 previous.motion = Pose::identity();
             }
         }
-        let events = if may_recover { Vec::new() } else { self.close_active().into_iter().collect() };
+        let events = if may_recover { Vec::new() } else { self.close_active(&[]).into_iter().collect() };
         if !may_recover {
             self.previous = None;
         }
@@ -395,7 +397,7 @@ impl Agent {
         tracked: &Tracked,
         inherited: Inheritance,
     ) -> Vec<Event> {
-        let Some(recent) = &self.recent else { return Vec::new() };
+        let Some(recent) = self.closed.back() else { return Vec::new() };
         let (from, chain) = (recent.id.clone(), recent.chain);
         let from_from_to = recent.agent_from_submap.inv_mul(&tracked.agent_from_camera);
         let (to, opened) = self.open_submap(frame, chain, tracked.agent_from_camera, inherited);
@@ -423,14 +425,22 @@ impl Agent {
         (id, Event::SubmapOpened(opened, frame.clone()))
     }
 
-    /// Finishes the submap under work; it stays to be tracked against.
-    fn close_active(&mut self) -> Option<Event> {
+    /// Finishes the submap under work. But for what the next one has `taken` over, it stays to be tracked against.
+    fn close_active(&mut self, taken: &[bool]) -> Option<Event> {
         let active = self.active.take()?;
         let (id, chain, agent_from_submap) = (active.id.clone(), active.chain, active.agent_from_submap);
-        let (surfels, intensity) = active.close(&self.settings.mapping);
-        let (surfels, intensity) = (Arc::new(surfels), Some(intensity));
-        self.recent =
-            Some(Recent { id: id.clone(), chain, surfels: surfels.clone(), intensity, agent_from_submap });
+        let (rest, intensity) = active.rest(taken, &self.settings.mapping);
+        let surfels = Arc::new(active.close(&self.settings.mapping));
+        while self.closed.len() >= self.settings.tracking.closed_submaps.max(1) {
+            self.closed.pop_front();
+        }
+        self.closed.push_back(Recent {
+            id: id.clone(),
+            chain,
+            surfels: Arc::new(rest),
+            intensity: Some(intensity),
+            agent_from_submap,
+        });
         Some(Event::SubmapClosed(id, surfels))
     }
 }

@@ -37,6 +37,8 @@ pub struct Inheritance {
     pub surfels: SurfelCloud,
     /// One for each.
     pub measured: Measured,
+    /// Of all surfels that were there, one for each: true for those that come along.
+    pub taken: Vec<bool>,
 }
 
 /// Takes over what the anchor `view` sees of `surfels`. `seed_px`: standard deviation of a new surfel, pixels.
@@ -48,7 +50,7 @@ pub fn inherit(
     seed_px: f32,
     settings: &InheritSettings,
 ) -> Inheritance {
-    let mut out = Inheritance::default();
+    let mut out = Inheritance { taken: vec![false; surfels.len()], ..Inheritance::default() };
     if !settings.enabled {
         return out;
     }
@@ -69,6 +71,7 @@ pub fn inherit(
         // The smaller scale isn't stretched along an incline.
         let size = surfel.scale_m[0].min(surfel.scale_m[1]) * level.camera.fx as f32 / center.z / seed_px;
         if size >= settings.min_size && size <= settings.max_size {
+            out.taken[index] = true;
             out.surfels.push(surfel);
             out.measured.push(measured.variance_m2[index], measured.intensity[index]);
         }
@@ -112,6 +115,7 @@ mod tests {
             let measured = Measured { variance_m2: vec![1e-4], intensity: vec![0.3] };
             let found = inherit(&cloud, &measured, &anchor_from_submap, &view, 1.6, &settings);
             assert_eq!(found.surfels.len(), comes as usize, "{center_m:?}, {size_px} px");
+            assert_eq!(found.taken, [comes]);
             if comes {
                 assert_eq!(found.measured, measured);
                 let off = Vector3::from(found.surfels.center_m[0]) - Vector3::from(center_m);

@@ -1,5 +1,6 @@
 //! What does the camera see? Surfels are seeded, grown, optimised and pruned.
 
+mod even;
 pub mod fuse;
 pub mod growth;
 pub mod inherit;

@@ -1,5 +1,6 @@
 //! New surfels from pixels: surface-fitting initialisation (eq. 6 to 8 of the CoMA-SLAM paper).
 
+use super::even::Squares;
 use super::unfitted::random_rotation;
 use coma_frame::{Image, RgbdFrame, normals};
 use coma_geometry::{Intrinsics, Pose};
@@ -16,8 +17,9 @@ pub struct SeedSettings {
     /// Standard deviation of a surfel in units of the spacing; the paper takes 1 (eq. 6). At 0.8 neighbours
     /// still cover a surface to an opacity of 0.98 and blur it less.
     pub scale_in_spacings: f32,
-    /// Where four pixels of the grid that lie in a square are all new, see one plane, and their cells' mean colours differ
-    /// in no channel by more than this, 0..1, one surfel of twice the size stands for them. 0: every pixel has its own.
+    /// Where four pixels of the grid that lie in a square are all new and see one plane, and a picture of half the
+    /// grid's resolution, interpolated, shows their colours to within this, 0..1, in every channel, one surfel of
+    /// twice the size stands for them. 0: every pixel has its own.
     pub even_color: f32,
     /// Opacity at birth.
     pub opacity: f32,
@@ -60,7 +62,7 @@ impl Default for SeedSettings {
 pub struct SeedGrid {
     /// Pixel `(i, j)` of this camera is the frame's `(first + spacing * i, first + spacing * j)`.
     pub camera: Intrinsics,
-    spacing: usize,
+    pub(super) spacing: usize,
     first: usize,
 }
 
@@ -102,7 +104,7 @@ pub fn seed(
     settings: &SeedSettings,
     grid: &SeedGrid,
     wanted: &Image<bool>,
-    color_at: impl Fn(usize, usize) -> [f32; 3],
+    color_at: impl Fn(usize, usize) -> [f32; 3] + Sync,
 ) -> Vec<Surfel> {
     let rotation = submap_from_camera.rotation.to_rotation_matrix().matrix().cast::<f32>();
     let translation: Vector3<f32> = submap_from_camera.translation.vector.cast();
@@ -124,16 +126,17 @@ pub fn seed(
             color,
         })
     };
+    let squares = (settings.even_color > 0.0).then(|| Squares::of(frame, grid, &color_at));
     let mut out = Vec::new();
     for (j, i) in
         (0..wanted.height()).step_by(2).flat_map(|j| (0..wanted.width()).step_by(2).map(move |i| (j, i)))
     {
         let square = [(i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)];
-        if let Some(color) = even_color(frame, settings, grid, wanted, &square, &color_at) {
-            let between = grid.pixel(i, j);
-            let center = (between.0 + grid.spacing / 2, between.1 + grid.spacing / 2);
-            if let Some(one) = surfel(center, 2.0, color) {
-                out.push(one);
+        let even = squares.as_ref().filter(|_| square.iter().all(|at| wanted.get(at.0, at.1) == Some(&true)));
+        if let Some(one) = even.and_then(|s| s.even(i, j, settings.even_color)) {
+            let larger = surfel(one.middle, 2.0, one.color);
+            if let Some(larger) = larger {
+                out.push(larger);
                 continue;
             }
         }
@@ -145,71 +148,6 @@ pub fn seed(
     }
     out
 }
-
-/// Mean colour of four pixels of the grid, if they are all wanted, lie in one plane and look alike.
-fn even_color(
-    frame: &RgbdFrame,
-    settings: &SeedSettings,
-    grid: &SeedGrid,
-    wanted: &Image<bool>,
-    square: &[(usize, usize); 4],
-    color_at: impl Fn(usize, usize) -> [f32; 3],
-) -> Option<[f32; 3]> {
-    let (last_i, last_j) = square[3];
-    // The last cells may reach beyond the picture.
-    let inside = last_i + 1 < wanted.width() && last_j + 1 < wanted.height() && settings.even_color > 0.0;
-    if !inside || !square.iter().all(|at| wanted[*at]) {
-        return None;
-    }
-    let colors = square.map(|(i, j)| cell_color(grid, i, j, &color_at));
-    let even = |channel: usize| {
-        let values = colors.map(|c| c[channel]);
-        let (low, high) = values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
-        high - low <= settings.even_color
-    };
-    let (x, y) = grid.pixel(square[0].0, square[0].1);
-    let reach = grid.spacing.div_ceil(2);
-    let plane = lies_in_plane(frame, x + grid.spacing / 2, y + grid.spacing / 2, reach + grid.spacing / 2);
-    ((0..3).all(even) && plane)
-        .then(|| std::array::from_fn(|channel| 0.25 * colors.iter().map(|c| c[channel]).sum::<f32>()))
-}
-
-/// Mean colour of the pixels that a pixel of the grid stands for.
-fn cell_color(grid: &SeedGrid, i: usize, j: usize, color_at: impl Fn(usize, usize) -> [f32; 3]) -> [f32; 3] {
-    let (x, y) = (grid.spacing * i, grid.spacing * j);
-    let cell = (0..grid.spacing).flat_map(|v| (0..grid.spacing).map(move |u| (x + u, y + v)));
-    let sum = cell.fold([0.0f32; 3], |sum, (u, v)| {
-        let color = color_at(u, v);
-        std::array::from_fn(|channel| sum[channel] + color[channel])
-    });
-    sum.map(|s| s / (grid.spacing * grid.spacing) as f32)
-}
-
-/// True if depth around a pixel is that of a plane, as far as noise lets one say. The inverse depth of a plane is linear
-/// over the picture.
-fn lies_in_plane(frame: &RgbdFrame, x: usize, y: usize, reach: usize) -> bool {
-    let (width, height) = (frame.depth_m.width(), frame.depth_m.height());
-    if x < reach || y < reach || x + reach >= width || y + reach >= height {
-        return false;
-    }
-    let inverse = |x: usize, y: usize| Some(frame.depth_m[(x, y)]).filter(|z| *z > 0.0).map(|z| 1.0 / z);
-    let Some(here) = inverse(x, y) else { return false };
-    // Of a sum with weights 1, -2, 1.
-    let sigma = 2.45 * frame.noise.sigma_m(1.0 / here) * here * here;
-    let ends = [
-        ((x - reach, y), (x + reach, y)),
-        ((x, y - reach), (x, y + reach)),
-        ((x - reach, y - reach), (x + reach, y + reach)),
-        ((x - reach, y + reach), (x + reach, y - reach)),
-    ];
-    ends.iter().all(|(a, b)| match (inverse(a.0, a.1), inverse(b.0, b.1)) {
-        (Some(a), Some(b)) => (a + b - 2.0 * here).abs() <= PLANE_SIGMA * sigma,
-        _ => false,
-    })
-}
-
-/// Depth that bends by less than so many standard deviations is that of a plane.
-const PLANE_SIGMA: f32 = 2.0;
 
 /// Centre, axes `(e1, e2, n)` and scales of a disc, in the camera: `size` times that of a pixel of the grid.
 fn disc(
@@ -337,6 +275,14 @@ mod tests {
         let checked =
             RgbdFrame::new(0, StampNs(0), plain.camera, plain.noise, checked, plain.depth_m.clone()).unwrap();
         assert_eq!(share(&checked), 0.0);
+        // Half the resolution shows a slope; beside a step it does not.
+        let shaded = |shade: fn(usize) -> u8| {
+            let color = Image::from_fn(32, 24, |x, _| [shade(x), 100, 50]);
+            RgbdFrame::new(0, StampNs(0), plain.camera, plain.noise, color, plain.depth_m.clone()).unwrap()
+        };
+        let (slope, step) = (shaded(|x| 3 * x as u8), shaded(|x| if x < 16 { 100 } else { 130 }));
+        assert_eq!(share(&slope), share(&plain));
+        assert!(share(&step) > 0.2 && share(&step) < 0.5, "{}", share(&step));
         // A pipe of 0.2 m.
         let bent = Image::from_fn(32, 24, |x, _| {
             let across = (x as f32 - 15.5) / 30.0 * 2.0;

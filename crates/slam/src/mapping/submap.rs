@@ -120,7 +120,7 @@ pub struct MappedFrame {
 impl ActiveSubmap {
     /// A submap with what it inherits; map its anchor next.
     pub fn open(id: SubmapId, chain: u32, agent_from_submap: Pose, inherited: Inheritance) -> Self {
-        let Inheritance { surfels, measured } = inherited;
+        let Inheritance { surfels, measured, .. } = inherited;
         ActiveSubmap {
             id,
             chain,
@@ -290,13 +290,28 @@ impl ActiveSubmap {
         inherit(&self.surfels, &self.measured, &anchor_from_submap, view, seed_px, &settings.inherit)
     }
 
-    /// The finished submap's surfels, pruned, and their measured intensity.
-    pub fn close(mut self, settings: &MappingSettings) -> (SurfelCloud, Vec<f32>) {
-        let keep: Vec<bool> = self.surfels.opacity.iter().map(|o| *o >= settings.prune_opacity).collect();
+    /// The finished submap's surfels, pruned.
+    pub fn close(mut self, settings: &MappingSettings) -> SurfelCloud {
+        let keep = self.opaque(settings);
         self.surfels.retain(&keep);
-        let mut kept = keep.iter();
-        self.measured.intensity.retain(|_| kept.next().is_some_and(|keep| *keep));
-        (self.surfels, self.measured.intensity)
+        self.surfels
+    }
+
+    /// What of the finished submap is left to track against beside one that took over `taken`: surfels and their
+    /// measured intensity.
+    pub fn rest(&self, taken: &[bool], settings: &MappingSettings) -> (SurfelCloud, Vec<f32>) {
+        let mut keep = self.opaque(settings);
+        for (keep, taken) in keep.iter_mut().zip(taken) {
+            *keep &= !taken;
+        }
+        let mut surfels = self.surfels.clone();
+        surfels.retain(&keep);
+        let measured = self.measured.intensity.iter().zip(keep);
+        (surfels, measured.filter_map(|(intensity, keep)| keep.then_some(*intensity)).collect())
+    }
+
+    fn opaque(&self, settings: &MappingSettings) -> Vec<bool> {
+        self.surfels.opacity.iter().map(|o| *o >= settings.prune_opacity).collect()
     }
 }
 
@@ -305,4 +320,35 @@ pub fn corrected_color(color: &Image<[u8; 3]>, brightness: Brightness) -> Image<
     let table: [f32; 256] =
         std::array::from_fn(|v| (brightness.gain as f32 * v as f32 / 255.0).clamp(0.0, 1.0));
     color.map(|c| c.map(|v| table[v as usize]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use coma_geometry::{AgentId, Epoch};
+    use coma_surfel::Surfel;
+
+    #[test]
+    fn what_the_next_submap_took_over_and_what_is_faint_is_not_tracked_against_again() {
+        let surfel = |opacity, x| Surfel {
+            center_m: [x, 0.0, 2.0],
+            rotation_wxyz: [0.0, 1.0, 0.0, 0.0],
+            scale_m: [0.01; 2],
+            opacity,
+            color: [0.5; 3],
+        };
+        let surfels: SurfelCloud =
+            [surfel(0.9, 1.0), surfel(0.01, 2.0), surfel(0.9, 3.0)].into_iter().collect();
+        let measured = Measured { variance_m2: vec![1e-4; 3], intensity: vec![0.1, 0.2, 0.3] };
+        let id = SubmapId { agent: AgentId::new("a").unwrap(), epoch: Epoch(0), number: 0 };
+        let inherited = Inheritance { surfels, measured, taken: Vec::new() };
+        let submap = ActiveSubmap::open(id, 0, Pose::identity(), inherited);
+        let settings = MappingSettings::default();
+        let x = |cloud: &SurfelCloud| cloud.center_m.iter().map(|c| c[0]).collect::<Vec<_>>();
+        let (rest, intensity) = submap.rest(&[true, false, false], &settings);
+        assert_eq!((x(&rest), intensity), (vec![3.0], vec![0.3]));
+        let (all, intensity) = submap.rest(&[], &settings);
+        assert_eq!((x(&all), intensity), (vec![1.0, 3.0], vec![0.1, 0.3]));
+        assert_eq!(x(&submap.close(&settings)), [1.0, 3.0]);
+    }
 }

@@ -41,6 +41,9 @@ pub struct TrackingSettings {
     pub adam: AdamSettings,
     /// Renders and alignments against the model per frame.
     pub model_rounds: u32,
+    /// Closed submaps that stay in the model beside the one under work: the last ones of the chain, at least 1. A camera
+    /// that comes back to what they show is tracked against it, where new surfels would hold the drift of a round.
+    pub closed_submaps: usize,
     /// The model is trusted where it is more opaque than this (eq. 4).
     pub model_opacity: f32,
     /// Below this share of fitting pixels the frame is mapped at once.
@@ -98,6 +101,7 @@ impl Default for TrackingSettings {
                 ..AlignSettings::default()
             },
             model_rounds: 1,
+            closed_submaps: 8,
             model_opacity: 0.9,
             map_at_once_share: 0.4,
             degraded_share: 0.25,
