@@ -292,6 +292,7 @@ impl Agent {
             covariance: Matrix6::zeros(),
             share: 1.0,
             agreement: 1.0,
+            noise_ratio: 1.0,
             map_at_once: false,
             hits: 0,
         };
@@ -401,7 +402,7 @@ impl Agent {
         let (from, chain) = (recent.id.clone(), recent.chain);
         let from_from_to = recent.agent_from_submap.inv_mul(&tracked.agent_from_camera);
         let (to, opened) = self.open_submap(frame, chain, tracked.agent_from_camera, inherited);
-        let information = odometry::information(&from_from_to, &tracked.covariance, frame);
+        let information = odometry::information(&from_from_to, tracked, frame);
         vec![opened, Event::Odometry(OdometryEdge { from, to, from_from_to, information })]
     }
 

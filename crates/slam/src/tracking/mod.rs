@@ -193,6 +193,8 @@ pub struct Tracked {
     pub share: f64,
     /// Of what the frame and the model both show, the share that fits.
     pub agreement: f64,
+    /// How far the frame's depth lies from the map's, in standard deviations of the sensor's noise.
+    pub noise_ratio: f64,
     /// Little of the frame is in the map yet.
     pub map_at_once: bool,
     /// Blended hits of the model's renderings.
@@ -293,6 +295,7 @@ pub(crate) fn judged(
         covariance: found.covariance(settings.floor_m, settings.floor_rad),
         share,
         agreement,
+        noise_ratio: found.geometric_scale,
         map_at_once: share < settings.map_at_once_share,
         hits,
     })
