@@ -22,7 +22,7 @@ pub(super) struct Squares<'a> {
 pub(super) struct Even {
     /// The square's middle, a pixel of the frame.
     pub middle: (usize, usize),
-    /// Mean over the square.
+    /// Mean around the middle, as far as the square reaches.
     pub color: [f32; 3],
 }
 
@@ -42,8 +42,14 @@ impl<'a> Squares<'a> {
 
     /// The square whose first pixel of the grid is `(i, j)`, both even, if it is plane and its cells' colours are to
     /// within `tolerance` those of squares, interpolated.
-    pub fn even(&self, i: usize, j: usize, tolerance: f32) -> Option<Even> {
-        let color = *self.colors.get(i / 2, j / 2)?;
+    pub fn even(
+        &self,
+        i: usize,
+        j: usize,
+        tolerance: f32,
+        color_at: &impl Fn(usize, usize) -> [f32; 3],
+    ) -> Option<Even> {
+        self.colors.get(i / 2, j / 2)?;
         let cells = [(i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)];
         let shown = cells.iter().all(|(i, j)| {
             let (cell, shown) = (self.cells[(*i, *j)], self.interpolated(*i, *j));
@@ -51,7 +57,7 @@ impl<'a> Squares<'a> {
         });
         let middle = (self.spacing * (i + 1), self.spacing * (j + 1));
         (shown && lies_in_plane(self.frame, middle.0, middle.1, self.spacing))
-            .then_some(Even { middle, color })
+            .then(|| Even { middle, color: mean_around(middle, self.spacing, color_at) })
     }
 
     /// Colour at a cell, between the squares around it.
@@ -89,6 +95,19 @@ fn means(
         }
     });
     out
+}
+
+/// Mean over the square that reaches `reach` pixels to either side of a pixel.
+fn mean_around((x, y): (usize, usize), reach: usize, value: &impl Fn(usize, usize) -> [f32; 3]) -> [f32; 3] {
+    let side = 2 * reach + 1;
+    let mut sum = [0.0f32; 3];
+    for (v, u) in (0..side).flat_map(|v| (0..side).map(move |u| (v, u))) {
+        let value = value(x + u - reach, y + v - reach);
+        for (sum, value) in sum.iter_mut().zip(value) {
+            *sum += value;
+        }
+    }
+    sum.map(|sum| sum / (side * side) as f32)
 }
 
 /// True if depth around a pixel is that of a plane, as far as noise lets one say. The inverse depth of a plane is linear

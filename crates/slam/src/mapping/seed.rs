@@ -133,7 +133,7 @@ pub fn seed(
     {
         let square = [(i, j), (i + 1, j), (i, j + 1), (i + 1, j + 1)];
         let even = squares.as_ref().filter(|_| square.iter().all(|at| wanted.get(at.0, at.1) == Some(&true)));
-        if let Some(one) = even.and_then(|s| s.even(i, j, settings.even_color)) {
+        if let Some(one) = even.and_then(|s| s.even(i, j, settings.even_color, &color_at)) {
             let larger = surfel(one.middle, 2.0, one.color);
             if let Some(larger) = larger {
                 out.push(larger);
@@ -282,6 +282,13 @@ mod tests {
         };
         let (slope, step) = (shaded(|x| 3 * x as u8), shaded(|x| if x < 16 { 100 } else { 130 }));
         assert_eq!(share(&slope), share(&plain));
+        let grid = SeedGrid::of(&slope.camera, &even);
+        let wanted = Image::filled(16, 12, true);
+        let shade = |x, y| slope.color[(x, y)].map(|v| v as f32 / 255.0);
+        for s in seed(&slope, &Pose::identity(), &even, &grid, &wanted, shade) {
+            let x = (s.center_m[0] / s.center_m[2] * 30.0 + 15.5).round();
+            assert!((s.color[0] - 3.0 * x / 255.0).abs() < 1e-4, "{:?} at {x}", s.color);
+        }
         assert!(share(&step) > 0.2 && share(&step) < 0.5, "{}", share(&step));
         // A pipe of 0.2 m.
         let bent = Image::from_fn(32, 24, |x, _| {

@@ -66,7 +66,7 @@ impl Default for MappingSettings {
             moved_new_share: 0.02,
             moved_m: 0.02,
             moved_rad: 1f64.to_radians(),
-            rest_after_frames: 10,
+            rest_after_frames: 5,
             growth: GrowthRule::Adaptive,
             growth_sigma: 3.0,
             growth_relative: 0.01,
