@@ -56,8 +56,13 @@ impl<'a> Squares<'a> {
             (0..3).all(|channel| (cell[channel] - shown[channel]).abs() <= tolerance)
         });
         let middle = (self.spacing * (i + 1), self.spacing * (j + 1));
-        (shown && lies_in_plane(self.frame, middle.0, middle.1, self.spacing))
-            .then(|| Even { middle, color: mean_around(middle, self.spacing, color_at) })
+        if !(shown && lies_in_plane(self.frame, middle.0, middle.1, self.spacing)) {
+            return None;
+        }
+        // The square's own mean belongs half a pixel beside its middle pixel, where the surfel lies: one that is symmetric
+        // about that pixel doesn't shift the picture.
+        let first = (middle.0 - self.spacing, middle.1 - self.spacing);
+        Some(Even { middle, color: mean(first, 2 * self.spacing + 1, color_at) })
     }
 
     /// Colour at a cell, between the squares around it.
@@ -83,26 +88,19 @@ fn means(
     value: &(impl Fn(usize, usize) -> [f32; 3] + Sync),
 ) -> Image<[f32; 3]> {
     let mut out = Image::filled(width, height, [0.0f32; 3]);
-    let share = 1.0 / (side * side) as f32;
     out.pixels_mut().par_chunks_mut(width.max(1)).enumerate().for_each(|(j, row)| {
-        for (i, mean) in row.iter_mut().enumerate() {
-            for (v, u) in (0..side).flat_map(|v| (0..side).map(move |u| (v, u))) {
-                let value = value(side * i + u, side * j + v);
-                for (sum, value) in mean.iter_mut().zip(value) {
-                    *sum += share * value;
-                }
-            }
+        for (i, out) in row.iter_mut().enumerate() {
+            *out = mean((side * i, side * j), side, value);
         }
     });
     out
 }
 
-/// Mean over the square that reaches `reach` pixels to either side of a pixel.
-fn mean_around((x, y): (usize, usize), reach: usize, value: &impl Fn(usize, usize) -> [f32; 3]) -> [f32; 3] {
-    let side = 2 * reach + 1;
+/// Mean over the square of `side` values that begins at `(x, y)`.
+fn mean((x, y): (usize, usize), side: usize, value: &impl Fn(usize, usize) -> [f32; 3]) -> [f32; 3] {
     let mut sum = [0.0f32; 3];
     for (v, u) in (0..side).flat_map(|v| (0..side).map(move |u| (v, u))) {
-        let value = value(x + u - reach, y + v - reach);
+        let value = value(x + u, y + v);
         for (sum, value) in sum.iter_mut().zip(value) {
             *sum += value;
         }
