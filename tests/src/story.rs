@@ -174,10 +174,12 @@ impl Cast {
         PlaceRecognitionClient::new(to_place).query(request).await.is_ok()
     }
 
-    /// What dpgo makes of everything that this agent knows.
+    /// What dpgo makes of the entries that this agent's map was solved from. Later ones that change no graph (places
+    /// described, pairs rejected) are given to dpgo with the next change, so they are not asked for.
     pub async fn solve(&self, index: usize) -> Result<v1::SolveResponse, tonic::Status> {
-        let status = self.agent(index).get_status(v1::GetStatusRequest {}).await?.into_inner();
-        let request = v1::SolveRequest { graph: status.agent_id, at_least: status.heads };
+        let graph = self.agent(index).get_status(v1::GetStatusRequest {}).await?.into_inner().agent_id;
+        let component = self.graph(index).await.components.swap_remove(0);
+        let request = v1::SolveRequest { graph, at_least: component.generation.unwrap().cut };
         let url = &self.dpgo.url;
         let to_dpgo = channel(url, &Default::default(), &ByteLedger::default(), Class::Local).unwrap();
         Ok(DpgoClient::new(to_dpgo).solve(request).await?.into_inner())

@@ -202,8 +202,8 @@ impl Bound {
     }
 
     /// Serves, with health, reflection (`descriptor_set` is the encoded contract) and the process's metrics under
-    /// `GET /metrics`, until the handle is shut down or dropped. From outside in: byte counts, authorization, admission with load shedding,
-    /// deadline.
+    /// `GET /metrics`, until the handle is shut down or dropped. From outside in: byte counts, authorization, admission
+    /// with load shedding, deadline.
     pub async fn serve(
         self,
         services: Services,
