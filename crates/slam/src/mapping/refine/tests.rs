@@ -161,8 +161,8 @@ fn pictures_of_another_exposure_do_not_change_colours() {
     let refine = |exposure| {
         // The prior draws the map towards the pictures' mean by its size in every step: here by 6 % of the way in all.
         let settings = RefineSettings { exposure, exposure_prior: 0.001, poses: false, ..settings(60) };
-        let mut job = Refiner::new(settings.clone(), coarse_map(), SurfelCloud::default(), poses());
-        let first = Refiner::new(settings, coarse_map(), SurfelCloud::default(), poses());
+        let mut job = Refiner::new(settings, coarse_map(), SurfelCloud::default(), poses());
+        let before = brightness(&job);
         for _ in 0..60 {
             let Some(view) = job.wants() else { break };
             let mut frame = frame(&poses()[view]);
@@ -171,7 +171,7 @@ fn pictures_of_another_exposure_do_not_change_colours() {
             frame.color = frame.color.map(|c| c.map(|v| (f32::from(v) * gain).min(255.0) as u8));
             job.step(&frame);
         }
-        (brightness(&job) / brightness(&first) - 1.0).abs()
+        (brightness(&job) / before - 1.0).abs()
     };
     let (with, without) = (refine(true), refine(false));
     assert!(with < 0.5 * without, "brightness changed by {with} and {without}");
