@@ -105,6 +105,16 @@ pub(crate) struct Blend<'a, const BLENDED: bool, const SURFACE: bool, const DETA
     pub out: &'a mut TileImages,
 }
 
+/// Weight of a hit in the front surface's depth. Discs are planes: beside the place where it touches a bent surface, a
+/// disc lies before it or behind, by the square of the distance, and on convex things every disc lies before it. So the
+/// nearest disc says nearly all; those beside it take over smoothly.
+#[inline(always)]
+fn eighth_power<S: Simd>(alpha: Lanes<S>) -> Lanes<S> {
+    let squared = alpha * alpha;
+    let fourth = squared * squared;
+    fourth * fourth
+}
+
 /// After so many surfels a block looks whether its pixels are done.
 const PATIENCE: usize = 4;
 
@@ -129,7 +139,8 @@ impl<const BLENDED: bool, const SURFACE: bool, const DETAIL: bool, const GROWTH:
                 let mut passing = pixels.inside(&constants).select(one, zero);
                 let (mut color, mut normal) = ([zero; 3], [zero; 3]);
                 let (mut depth, mut depth_squared, mut median) = (zero, zero, zero);
-                let (mut surface, mut surface_depth, mut surface_intensity) = (zero, zero, zero);
+                let (mut surface, mut surface_depth) = (zero, zero);
+                let (mut shaded, mut surface_intensity) = (zero, zero);
                 let (mut near, mut counted) = (zero, zero);
                 let observed = Lanes::load(simd, &self.observed.depth, at);
                 let tolerance = Lanes::load(simd, &self.observed.tolerance, at);
@@ -162,15 +173,15 @@ impl<const BLENDED: bool, const SURFACE: bool, const DETAIL: bool, const GROWTH:
                     if SURFACE {
                         // One surface is what lies together; the first that outweighs what came before it counts.
                         let alpha = live.select(hit.alpha, zero);
+                        let weight = eighth_power(alpha);
                         let gap = hit.depth.mul_add(surface, zero - surface_depth).abs();
                         let joins = gap.at_most(constants.surface_relative * hit.depth * surface);
-                        let outweighs = surface.less(alpha);
-                        let (joined, own) = (alpha.mul_add(hit.depth, surface_depth), alpha * hit.depth);
-                        surface_depth = joins.select(joined, outweighs.select(own, surface_depth));
-                        let shade = alpha * number(p.intensity);
-                        let shades = surface_intensity + shade;
-                        surface_intensity = joins.select(shades, outweighs.select(shade, surface_intensity));
-                        surface = joins.select(surface + alpha, outweighs.select(alpha, surface));
+                        let outweighs = surface.less(weight);
+                        let grown = |sum, by| joins.select(sum + by, outweighs.select(by, sum));
+                        surface_depth = grown(surface_depth, weight * hit.depth);
+                        surface = grown(surface, weight);
+                        surface_intensity = grown(surface_intensity, alpha * number(p.intensity));
+                        shaded = grown(shaded, alpha);
                     }
                     if DETAIL {
                         depth_squared = weighted_depth.mul_add(hit.depth, depth_squared);
@@ -201,9 +212,8 @@ impl<const BLENDED: bool, const SURFACE: bool, const DETAIL: bool, const GROWTH:
                 }
                 if SURFACE {
                     let found = zero.less(surface);
-                    let share = found.select(one / surface, zero);
-                    (surface_depth * share).store(&mut out.surface, at);
-                    (surface_intensity * share).store(&mut out.intensity, at);
+                    found.select(surface_depth / surface, zero).store(&mut out.surface, at);
+                    found.select(surface_intensity / shaded, zero).store(&mut out.intensity, at);
                 }
                 if DETAIL {
                     let variance = depth_squared * share - expected * expected;

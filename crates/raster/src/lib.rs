@@ -59,8 +59,9 @@ pub struct Rendering {
     pub depth_m: Image<f32>,
     /// Depth at which half of the light is blocked, metres; 0 where it never is.
     pub median_depth_m: Image<f32>,
-    /// Mean depth of the front surface's hits by their alpha alone, metres; 0 where nothing was hit. Expected depth
-    /// is drawn towards the camera, as nearer surfels of one surface hide those behind; this is not.
+    /// Depth of the front surface, metres: the mean over its hits by the eighth power of their alpha; 0 where nothing was
+    /// hit. Expected depth is drawn towards the camera, as nearer surfels of one surface hide those behind, and the
+    /// planes of discs lie before what is convex; this is not.
     pub surface_depth_m: Image<f32>,
     /// Mean intensity of the front surface's hits by their alpha alone, 0..1. Blended colour at a pixel is mostly that of
     /// the nearest surfel that reaches it, so that what is painted on an inclined surface is drawn away from the camera;

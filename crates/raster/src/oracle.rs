@@ -32,9 +32,9 @@ pub struct OraclePixel {
     pub opacity: f64,
     /// Depth at which half of the light is blocked, 0 where it never is.
     pub median: f64,
-    /// Mean depth of the front surface's hits.
+    /// Mean depth of the front surface's hits, by the eighth power of their alpha.
     pub surface: f64,
-    /// Mean intensity of the front surface's hits.
+    /// Mean intensity of the front surface's hits, by their alpha.
     pub surface_intensity: f64,
 }
 
@@ -101,7 +101,7 @@ fn pixel(
     settings: &RenderSettings,
 ) -> OraclePixel {
     let (mut passing, mut depth_sum) = (1.0f64, 0.0f64);
-    let (mut surface, mut surface_sum, mut shades) = (0.0f64, 0.0f64, 0.0f64);
+    let (mut surface, mut surface_sum, mut shaded, mut shades) = (0.0f64, 0.0f64, 0.0f64, 0.0f64);
     let mut out = OraclePixel::default();
     for s in order {
         let (alpha, depth) = hit(s, x, y, camera, settings);
@@ -120,16 +120,18 @@ fn pixel(
         let together =
             (depth * surface - surface_sum).abs() <= settings.surface_relative as f64 * depth * surface;
         let shade = alpha * (0.299 * s.color[0] + 0.587 * s.color[1] + 0.114 * s.color[2]);
+        let weight = alpha.powi(8);
         if together {
-            (surface, surface_sum, shades) = (surface + alpha, surface_sum + alpha * depth, shades + shade);
-        } else if surface < alpha {
-            (surface, surface_sum, shades) = (alpha, alpha * depth, shade);
+            (surface, surface_sum) = (surface + weight, surface_sum + weight * depth);
+            (shaded, shades) = (shaded + alpha, shades + shade);
+        } else if surface < weight {
+            (surface, surface_sum, shaded, shades) = (weight, weight * depth, alpha, shade);
         }
         passing = after;
     }
     out.opacity = 1.0 - passing;
     if surface > 0.0 {
-        (out.surface, out.surface_intensity) = (surface_sum / surface, shades / surface);
+        (out.surface, out.surface_intensity) = (surface_sum / surface, shades / shaded);
     }
     out.depth = if out.opacity > 0.0 { depth_sum / out.opacity } else { 0.0 };
     out

@@ -92,6 +92,40 @@ fn the_oracle_agrees_everywhere() {
 }
 
 #[test]
+fn the_front_of_a_ball_lies_where_the_ball_is() {
+    // A ball of 0.25 m, 2 m away, made of a disc for every fourth pixel.
+    let camera = Intrinsics { width: 96, height: 80, fx: 300.0, fy: 300.0, cx: 47.5, cy: 39.5 };
+    let (middle, radius) = (Vector3::new(0.0, 0.0, 2.0), 0.25);
+    let front = |x: f64, y: f64| {
+        let ray = camera.ray(x, y);
+        let (half, squared) = (ray.dot(&middle) / ray.norm_squared(), ray.norm_squared());
+        half - (half * half - (middle.norm_squared() - radius * radius) / squared).sqrt()
+    };
+    let mut ball = SurfelCloud::default();
+    for (x, y) in (2..80).step_by(4).flat_map(|y| (2..96).step_by(4).map(move |x| (x as f64, y as f64))) {
+        let center = camera.ray(x, y) * front(x, y);
+        let turn = UnitQuaternion::rotation_between(&Vector3::z(), &(center - middle)).unwrap().cast::<f32>();
+        ball.push(Surfel {
+            center_m: center.cast().into(),
+            rotation_wxyz: [turn.w, turn.i, turn.j, turn.k],
+            scale_m: [(3.2 * center.z / camera.fx) as f32; 2],
+            opacity: 0.95,
+            color: [0.5; 3],
+        });
+    }
+    let views = [SubmapView::new(&ball, Pose::identity())];
+    let rendering = render(&views, &camera, &RenderSettings::default(), None);
+    // Half of the ball's width, so that the rim is left out.
+    let seen = (22..58).flat_map(|y| (30..66).map(move |x| (x, y)));
+    let mean = |image: &Image<f32>| {
+        let errors = seen.clone().map(|(x, y)| image[(x, y)] as f64 - front(x as f64, y as f64));
+        errors.sum::<f64>() / seen.clone().count() as f64
+    };
+    let (surface, expected) = (mean(&rendering.surface_depth_m), mean(&rendering.depth_m));
+    assert!(surface.abs() < 4e-4 && expected < -1.5e-3, "{surface} m, blended {expected} m");
+}
+
+#[test]
 fn the_harness_sees_a_surfel_that_is_missing_or_moved() {
     let mut cloud = surfels(1, 60);
     let views = [SubmapView::new(&cloud, Pose::identity())];
