@@ -7,10 +7,10 @@ use coma_geometry::{Matrix6, Pose, se3};
 /// Drift of tracking across a submap, standard deviations by metre and by radian of its way. Calibrated, as all
 /// numbers here, on the built-in world with an ideal and with a noisy sensor and on a rendered room: the mean squared
 /// normalised error of edges stays under 12.
-const METRES_PER_METRE: f64 = 0.0008;
-const METRES_PER_RADIAN: f64 = 0.0003;
-const RADIANS_PER_RADIAN: f64 = 0.0008;
-const RADIANS_PER_METRE: f64 = 0.0003;
+const METRES_PER_METRE: f64 = 0.0003;
+const METRES_PER_RADIAN: f64 = 0.0001;
+const RADIANS_PER_RADIAN: f64 = 0.0003;
+const RADIANS_PER_METRE: f64 = 0.0001;
 /// Drift that the sensor causes: standard deviations of its depth, where the frame's typical depth lies and as large as
 /// the frame shows them to be. The map that is tracked against carries the noise of the frames that it was made of, and
 /// fusion averages a part of it out.
@@ -79,14 +79,14 @@ mod tests {
 
     fn deviations(way_m: f64, noise_ratio: f64, frame: &RgbdFrame) -> (f64, f64) {
         let way = se3::exp(&Tangent::new(way_m, 0.0, 0.0, 0.0, 0.1, 0.0));
-        let tracked = tracked(noise_ratio, Matrix6::identity() * 1e-8);
+        let tracked = tracked(noise_ratio, Matrix6::identity() * 1e-12);
         let covariance = information(&way, &tracked, frame).try_inverse().unwrap();
         (covariance[(0, 0)].sqrt(), covariance[(5, 5)].sqrt())
     }
 
     #[test]
     fn a_longer_way_and_a_noisier_sensor_leave_less_certainty() {
-        let clean = DepthNoise { base_m: 1e-4, quadratic_per_m: 0.0 };
+        let clean = DepthNoise { base_m: 1e-5, quadratic_per_m: 0.0 };
         let near = deviations(0.2, 1.0, &frame(1.0, clean));
         let far = deviations(2.0, 1.0, &frame(1.0, clean));
         assert!(far.0 > 5.0 * near.0 && far.1 > 2.0 * near.1, "{near:?} {far:?}");

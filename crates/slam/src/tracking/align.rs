@@ -30,7 +30,8 @@ pub struct AlignSettings {
     pub photometric_weight: f32,
     /// Smallest photometric scale, intensity 0..1: sensor noise and rounding.
     pub min_photometric_scale: f32,
-    /// Smallest geometric scale, in units of sigma(z).
+    /// Smallest geometric scale, in units of sigma(z): what a clean sensor's depth is good to. A larger one lets bent
+    /// surfaces and edges, where discs are a poor picture, count as much as walls.
     pub min_geometric_scale: f32,
     /// Residuals in units of their scale follow a t-distribution with so many degrees of freedom: the fewer, the less
     /// those count that don't fit.
@@ -52,7 +53,7 @@ impl Default for AlignSettings {
             max_distance_m: 0.06,
             photometric_weight: 1.2,
             min_photometric_scale: 0.008,
-            min_geometric_scale: 0.1,
+            min_geometric_scale: 0.02,
             freedom: 5.0,
             prior_m: 0.05,
             prior_rad: 0.05,
@@ -93,7 +94,7 @@ pub struct Alignment {
     pub inliers: usize,
     /// Those of them that look like their partner.
     pub alike: usize,
-    /// Robust scale of the geometric residuals, in units of sigma(z).
+    /// Robust scale of the geometric residuals, in units of sigma(z), however small.
     pub geometric_scale: f64,
     /// Robust scale of the photometric residuals.
     pub photometric_scale: f64,
@@ -185,7 +186,7 @@ pub fn align(
         matched: system.matched,
         inliers: system.inliers,
         alike: system.alike,
-        geometric_scale: scales.geometric,
+        geometric_scale: 1.4826 * system.geometric.median(),
         photometric_scale: scales.photometric,
         median_distance_m: system.median_distance_m(),
     })

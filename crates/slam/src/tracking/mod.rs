@@ -112,8 +112,8 @@ impl Default for TrackingSettings {
             min_depth_share: 0.05,
             max_step_m: 0.5,
             max_step_rad: 0.6,
-            floor_m: 0.0005,
-            floor_rad: 0.02f64.to_radians(),
+            floor_m: 0.0001,
+            floor_rad: 0.005f64.to_radians(),
         }
     }
 }
