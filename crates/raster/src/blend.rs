@@ -173,13 +173,13 @@ impl<const BLENDED: bool, const SURFACE: bool, const DETAIL: bool, const GROWTH:
                     if SURFACE {
                         // One surface is what lies together; the first that outweighs what came before it counts.
                         let alpha = live.select(hit.alpha, zero);
-                        let weight = eighth_power(alpha);
+                        let nearness = eighth_power(alpha);
                         let gap = hit.depth.mul_add(surface, zero - surface_depth).abs();
                         let joins = gap.at_most(constants.surface_relative * hit.depth * surface);
-                        let outweighs = surface.less(weight);
+                        let outweighs = surface.less(nearness);
                         let grown = |sum, by| joins.select(sum + by, outweighs.select(by, sum));
-                        surface_depth = grown(surface_depth, weight * hit.depth);
-                        surface = grown(surface, weight);
+                        surface_depth = grown(surface_depth, nearness * hit.depth);
+                        surface = grown(surface, nearness);
                         surface_intensity = grown(surface_intensity, alpha * number(p.intensity));
                         shaded = grown(shaded, alpha);
                     }

@@ -186,7 +186,7 @@ pub fn align(
         matched: system.matched,
         inliers: system.inliers,
         alike: system.alike,
-        geometric_scale: 1.4826 * system.geometric.median(),
+        geometric_scale: system.geometric.deviation(),
         photometric_scale: scales.photometric,
         median_distance_m: system.median_distance_m(),
     })
@@ -239,6 +239,11 @@ impl Histogram {
             seen += count;
         }
         0.0
+    }
+
+    /// Standard deviation, if the sizes were those of normal residuals.
+    fn deviation(&self) -> f64 {
+        1.4826 * self.median()
     }
 }
 
@@ -460,11 +465,10 @@ impl System {
         self
     }
 
-    /// 1.4826 x median: the standard deviation, if the residuals were normal.
     fn scales(&self, settings: &AlignSettings) -> Scales {
         Scales {
-            geometric: (1.4826 * self.geometric.median()).max(settings.min_geometric_scale as f64),
-            photometric: (1.4826 * self.photometric.median()).max(settings.min_photometric_scale as f64),
+            geometric: self.geometric.deviation().max(settings.min_geometric_scale as f64),
+            photometric: self.photometric.deviation().max(settings.min_photometric_scale as f64),
         }
     }
 
