@@ -2,11 +2,12 @@
 
 use crate::consensus;
 use crate::gicp;
-use crate::icp::{self, Searchable};
+use crate::icp::{self, Searchable, Steps};
 use crate::information::{Observability, focal_sensitivity, information};
 use crate::matching::mutual_matches;
 use crate::outcome::{Alignment, Outcome, Reason, Side};
-use crate::settings::{Refiner, Scale, Settings};
+use crate::pixels::Pixels;
+use crate::settings::{Refiner, Settings};
 use crate::verify;
 use crate::view::{Prepared, View};
 use coma_geometry::{Matrix6, Pose, se3};
@@ -71,9 +72,10 @@ pub fn decide(
     // The best few get a coarse ICP and are ranked again.
     hypotheses.truncate(settings.refined_hypotheses.max(1));
     let (source_coarse, target_coarse) = searchable(source, target, 0, 1500);
+    let steps = Steps::from(&settings.scales[0]);
     for hypothesis in &mut hypotheses {
         let initial = hypothesis.target_from_source;
-        match refine_scale(&source_coarse, &target_coarse, &initial, &settings.scales[0], settings) {
+        match refine_scale(&source_coarse, &target_coarse, &initial, &steps, settings) {
             Some(pose) => {
                 hypothesis.score = verify::evidence(source, target, &pose, settings).score;
                 hypothesis.target_from_source = pose;
@@ -82,6 +84,7 @@ pub fn decide(
         }
     }
     hypotheses.sort_by(|a, b| b.score.total_cmp(&a.score));
+    let pixels = both_pixels(source, target, settings);
     let mut best: Option<(f64, Alignment)> = None;
     let mut first_reason = None;
     for hypothesis in distinct(hypotheses).iter().take(settings.verified_hypotheses.max(1)) {
@@ -89,7 +92,7 @@ pub fn decide(
         if best.as_ref().is_some_and(|b| hypothesis.score < 0.8 * b.0) {
             break;
         }
-        match judged(source, target, hypothesis, settings) {
+        match judged(source, target, pixels.as_ref(), hypothesis, settings) {
             Ok((score, alignment)) => {
                 if best.as_ref().is_none_or(|b| score > b.0) {
                     best = Some((score, alignment));
@@ -124,10 +127,11 @@ fn distinct(hypotheses: Vec<Hypothesis>) -> Vec<Hypothesis> {
 fn judged(
     source: &Prepared,
     target: &Prepared,
+    pixels: Option<&(Pixels, Pixels)>,
     hypothesis: &Hypothesis,
     settings: &Settings,
 ) -> Result<(f64, Alignment), Reason> {
-    let refined = refine(source, target, &hypothesis.target_from_source, settings)?;
+    let refined = refine_with(source, target, pixels, &hypothesis.target_from_source, settings)?;
     let evidence = verify::verify(source, target, &refined.target_from_source, settings)?;
     if !(refined.calibration_m <= settings.max_calibration_m) {
         let (metres, allowed) = (refined.calibration_m, settings.max_calibration_m);
@@ -187,23 +191,49 @@ pub fn refine(
     initial: &Pose,
     settings: &Settings,
 ) -> Result<Refined, Reason> {
+    let pixels = both_pixels(source, target, settings);
+    refine_with(source, target, pixels.as_ref(), initial, settings)
+}
+
+/// Both views' points of the pixel scale, if there is one.
+fn both_pixels(source: &Prepared, target: &Prepared, settings: &Settings) -> Option<(Pixels, Pixels)> {
+    let of = |view: &Prepared| Pixels::new(view, settings.depth_jump, &settings.pixels);
+    (settings.pixels.points > 0).then(|| (of(source), of(target)))
+}
+
+fn refine_with(
+    source: &Prepared,
+    target: &Prepared,
+    pixels: Option<&(Pixels, Pixels)>,
+    initial: &Pose,
+    settings: &Settings,
+) -> Result<Refined, Reason> {
     let needed = settings.min_correspondences;
     let diverged = |correspondences| Reason::Diverged { correspondences, needed };
     let mut pose = *initial;
     let mut observability = None;
     let mut residuals = Vec::new();
-    for (level, scale) in settings.scales.iter().enumerate() {
-        let (s, t) = searchable(source, target, level, settings.icp_points);
-        pose = refine_scale(&s, &t, &pose, scale, settings).ok_or(diverged(0))?;
-        residuals = icp::linearise(&s, &t, &pose, scale.max_correspondence_m);
+    let mut at_scale = |s: &Searchable, t: &Searchable, steps: &Steps| {
+        pose = refine_scale(s, t, &pose, steps, settings).ok_or(diverged(0))?;
+        let mut residuals = icp::linearise(s, t, &pose, steps.max_correspondence_m);
         if settings.refiner == Refiner::Generalised {
             // What the refiner did not look at pins nothing.
             residuals.iter_mut().for_each(icp::Residual::forget_brightness);
         }
+        Ok(residuals)
+    };
+    for (level, scale) in settings.scales.iter().enumerate() {
+        let (s, t) = searchable(source, target, level, settings.icp_points);
+        residuals = at_scale(&s, &t, &Steps::from(scale))?;
         if level == 0 {
             // Judged where normals and gradients are calmest: their noise looks like structure.
             observability = Observability::new(&residuals, settings);
         }
+    }
+    if let Some((source_pixels, target_pixels)) = pixels {
+        let s = Searchable::by_projection(source_pixels, source.noise);
+        let t = Searchable::by_projection(target_pixels, target.noise);
+        residuals = at_scale(&s, &t, &Steps::from(&settings.pixels))?;
     }
     let floor = settings.min_eigenvalue_ratio;
     let Some(observability) = observability else {
@@ -241,12 +271,12 @@ fn refine_scale(
     source: &Searchable,
     target: &Searchable,
     initial: &Pose,
-    scale: &Scale,
+    steps: &Steps,
     settings: &Settings,
 ) -> Option<Pose> {
     match settings.refiner {
-        Refiner::Coloured => icp::refine_scale(source, target, initial, scale, settings),
-        Refiner::Generalised => gicp::refine_scale(source, target, initial, scale),
+        Refiner::Coloured => icp::refine_scale(source, target, initial, steps, settings),
+        Refiner::Generalised => gicp::refine_scale(source, target, initial, steps),
     }
 }
 

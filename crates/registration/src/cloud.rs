@@ -60,13 +60,8 @@ impl PointCloud {
     /// One point per occupied voxel: the mean of its points and intensities, in the order of the voxels
     /// (z, then y, then x). Normals and gradients are not carried over.
     pub fn voxel_downsample(&self, voxel_m: f32) -> PointCloud {
-        let cell = |v: f32| ((v / voxel_m).floor() as i64 + (1 << 20)).clamp(0, (1 << 21) - 1) as u64;
-        let mut order: Vec<(u64, u32)> = self
-            .points
-            .iter()
-            .enumerate()
-            .map(|(i, p)| (cell(p.z) << 42 | cell(p.y) << 21 | cell(p.x), i as u32))
-            .collect();
+        let mut order: Vec<(u64, u32)> =
+            self.points.iter().enumerate().map(|(i, p)| (voxel(p, voxel_m), i as u32)).collect();
         order.sort_unstable();
         let mut out = PointCloud::default();
         for voxel in order.chunk_by(|a, b| a.0 == b.0) {
@@ -96,6 +91,12 @@ impl PointCloud {
             .collect();
         (self.normals, self.gradients) = surfaces.into_iter().unzip();
     }
+}
+
+/// The voxel that holds a point, as one number: in the order of z, then y, then x.
+pub(crate) fn voxel(point: &Point3<f32>, voxel_m: f32) -> u64 {
+    let cell = |v: f32| ((v / voxel_m).floor() as i64 + (1 << 20)).clamp(0, (1 << 21) - 1) as u64;
+    cell(point.z) << 42 | cell(point.y) << 21 | cell(point.x)
 }
 
 /// Normal and intensity gradient of point `i` from its neighbours; zeros where they span no plane.

@@ -1,8 +1,7 @@
 //! Generalised ICP (Segal, Haehnel, Thrun: "Generalized-ICP", RSS 2009), plane to plane: both points of a pair are
 //! free to slide along their surfaces. Uses no colour: the refiner for cameras whose brightness says nothing.
 
-use crate::icp::{Searchable, correspondences, depth_weight};
-use crate::settings::Scale;
+use crate::icp::{Searchable, Steps, correspondences, depth_weight};
 use coma_geometry::{Matrix6, Pose, Tangent, se3};
 use nalgebra::{Matrix3, Matrix3x6, Point3, Vector3};
 
@@ -19,10 +18,10 @@ struct Pair {
 }
 
 /// Gauss-Newton at one scale. `None` if correspondences run out or the system is singular beyond damping.
-pub fn refine_scale(source: &Searchable, target: &Searchable, initial: &Pose, scale: &Scale) -> Option<Pose> {
+pub fn refine_scale(source: &Searchable, target: &Searchable, initial: &Pose, steps: &Steps) -> Option<Pose> {
     let mut pose = *initial;
-    for _ in 0..scale.iterations {
-        let pairs = pairs(source, target, &pose, scale.max_correspondence_m);
+    for _ in 0..steps.iterations {
+        let pairs = pairs(source, target, &pose, steps.max_correspondence_m);
         if pairs.len() < 12 {
             return None;
         }
@@ -55,8 +54,7 @@ pub fn refine_scale(source: &Searchable, target: &Searchable, initial: &Pose, sc
         }
         pose *= se3::exp(&step);
         pose.rotation.renormalize();
-        let small = crate::icp::CONVERGED_VOXELS * scale.voxel_m as f64;
-        if step.fixed_rows::<3>(0).norm() < small && step.fixed_rows::<3>(3).norm() < small {
+        if steps.settled_by(&step) {
             break;
         }
     }

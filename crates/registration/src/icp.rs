@@ -4,7 +4,8 @@
 
 use crate::cloud::PointCloud;
 use crate::neighbours::Neighbours;
-use crate::settings::{Scale, Settings};
+use crate::pixels::Pixels;
+use crate::settings::{PixelScale, Scale, Settings};
 use coma_frame::DepthNoise;
 use coma_geometry::{Matrix6, Pose, Tangent, se3};
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -39,11 +40,19 @@ impl Residual {
     }
 }
 
+/// How a point's counterpart is found.
+enum Search<'a> {
+    /// The nearest one.
+    Tree(Neighbours),
+    /// The one that is seen in its direction.
+    Projection(&'a Pixels),
+}
+
 /// A cloud that can be searched.
 pub struct Searchable<'a> {
     cloud: &'a PointCloud,
     noise: DepthNoise,
-    tree: Neighbours,
+    search: Search<'a>,
     /// Indices of the points that look for a correspondence.
     queries: Vec<u32>,
 }
@@ -51,9 +60,15 @@ pub struct Searchable<'a> {
 impl<'a> Searchable<'a> {
     /// Builds the tree and picks at most `queries` points, evenly.
     pub fn new(cloud: &'a PointCloud, noise: DepthNoise, queries: usize) -> Self {
-        let count = cloud.len().min(queries);
-        let queries = (0..count).map(|i| (i * cloud.len() / count) as u32).collect();
-        Searchable { cloud, noise, tree: Neighbours::new(&cloud.points), queries }
+        let search = Search::Tree(Neighbours::new(&cloud.points));
+        let all: Vec<u32> = (0..cloud.len() as u32).collect();
+        Searchable { cloud, noise, search, queries: evenly(&all, queries) }
+    }
+
+    /// The same for pixels, which are found by projection.
+    pub fn by_projection(pixels: &'a Pixels, noise: DepthNoise) -> Self {
+        let queries = pixels.queries.clone();
+        Searchable { cloud: &pixels.cloud, noise, search: Search::Projection(pixels), queries }
     }
 
     /// The cloud itself.
@@ -76,11 +91,21 @@ impl<'a> Searchable<'a> {
     ) -> Option<usize> {
         let point = self.cloud.points[i];
         let reach = max_m.max(3.0 * self.noise.sigma_m(point.z));
-        let (j, _) = into.tree.nearest(&(into_from_self * point), reach)?;
+        let moved = into_from_self * point;
+        let j = match &into.search {
+            Search::Tree(tree) => tree.nearest(&moved, reach)?.0,
+            Search::Projection(pixels) => pixels.at(&moved, reach)?,
+        };
         let own_normal = into_from_self.rotation * self.cloud.normals[i];
         // A normal of zero fails this test too.
         (into.cloud.normals[j].dot(&own_normal) > 0.5).then_some(j)
     }
+}
+
+/// At most `count` of them, evenly.
+pub(crate) fn evenly(of: &[u32], count: usize) -> Vec<u32> {
+    let count = of.len().min(count);
+    (0..count).map(|i| of[i * of.len() / count]).collect()
 }
 
 /// Queries of `from` with their counterparts in `into`.
@@ -223,7 +248,7 @@ impl Scales {
     pub fn of(residuals: &[Residual]) -> Self {
         let robust = |values: Vec<f64>, floor: f64| (1.4826 * median(values)).max(floor);
         Scales {
-            geometric: robust(residuals.iter().map(|r| (r.geometric_m / r.sigma_m).abs()).collect(), 0.1),
+            geometric: robust(residuals.iter().map(|r| (r.geometric_m / r.sigma_m).abs()).collect(), 0.02),
             photometric: robust(residuals.iter().map(|r| r.photometric.abs()).collect(), 0.005),
         }
     }
@@ -232,6 +257,21 @@ impl Scales {
     pub fn weights(&self, r: &Residual) -> (f64, f64) {
         let cauchy = |x: f64| 1.0 / (1.0 + x * x / (2.0 * 2.0));
         (cauchy(r.geometric_m / r.sigma_m / self.geometric), cauchy(r.photometric / self.photometric))
+    }
+
+    /// Weights of both parts in the sum that the motion minimises (Park 2017, eq. (7): E = (1 - sigma) E_C + sigma E_G).
+    /// Surfaces that meet far better than the sensors promise count the more.
+    pub fn motion_weights(&self, r: &Residual, settings: &Settings) -> (f64, f64) {
+        let (wg, wp) = self.shares(r, settings);
+        let better = (self.geometric / ORDINARY_SCALE).min(1.0);
+        (wg / (better * better), wp)
+    }
+
+    /// The same as if surfaces met as they ordinarily do.
+    pub fn shares(&self, r: &Residual, settings: &Settings) -> (f64, f64) {
+        let (wg, wp) = self.weights(r);
+        let share = settings.geometric_share;
+        (wg * share * depth_weight(r.sigma_m), wp * (1.0 - share))
     }
 }
 
@@ -243,37 +283,71 @@ fn median(mut values: Vec<f64>) -> f64 {
     *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }
 
+/// Geometric scale from which on `geometric_share` holds: two views of a real depth sensor, averaged to the working
+/// size, meet at 0.5 to 0.9 of what the sensor promises.
+const ORDINARY_SCALE: f64 = 0.5;
+
 /// Weight of depth by its noise: a point at 1 cm counts in full, noisier ones by variance.
 pub fn depth_weight(sigma_m: f64) -> f64 {
     const FULL_WEIGHT_SIGMA_M: f64 = 0.01;
     (FULL_WEIGHT_SIGMA_M / sigma_m).powi(2).min(1.0)
 }
 
-/// A scale has converged when a step is below this many voxels (and as many radians per metre).
-pub(crate) const CONVERGED_VOXELS: f64 = 0.01;
+/// A voxel scale has settled when a step is below this many voxels (and as many radians per metre).
+const SETTLED_VOXELS: f64 = 0.01;
+/// The pixel scale has when it is below this, metres.
+const SETTLED_PIXELS_M: f64 = 1e-5;
+
+/// What Gauss-Newton needs to know of a scale.
+#[derive(Clone, Copy, Debug)]
+pub struct Steps {
+    /// Points further apart than this never correspond, metres.
+    pub max_correspondence_m: f32,
+    /// Most steps.
+    pub iterations: usize,
+    /// A step shorter than this, metres and radians alike, is the last.
+    pub settled: f64,
+}
+
+impl Steps {
+    /// Whether a step is the last.
+    pub(crate) fn settled_by(&self, step: &Tangent) -> bool {
+        step.fixed_rows::<3>(0).norm() < self.settled && step.fixed_rows::<3>(3).norm() < self.settled
+    }
+}
+
+impl From<&Scale> for Steps {
+    fn from(scale: &Scale) -> Self {
+        let Scale { voxel_m, max_correspondence_m, iterations } = *scale;
+        Steps { max_correspondence_m, iterations, settled: SETTLED_VOXELS * voxel_m as f64 }
+    }
+}
+
+impl From<&PixelScale> for Steps {
+    fn from(scale: &PixelScale) -> Self {
+        let PixelScale { max_correspondence_m, iterations, .. } = *scale;
+        Steps { max_correspondence_m, iterations, settled: SETTLED_PIXELS_M }
+    }
+}
 
 /// Gauss-Newton at one scale. `None` if correspondences run out or the system is singular beyond damping.
 pub fn refine_scale(
     source: &Searchable,
     target: &Searchable,
     initial: &Pose,
-    scale: &Scale,
+    steps: &Steps,
     settings: &Settings,
 ) -> Option<Pose> {
     let mut pose = *initial;
-    for _ in 0..scale.iterations {
-        let residuals = linearise(source, target, &pose, scale.max_correspondence_m);
+    for _ in 0..steps.iterations {
+        let residuals = linearise(source, target, &pose, steps.max_correspondence_m);
         if residuals.len() < 12 {
             return None;
         }
         let scales = Scales::of(&residuals);
-        let (geometric, photometric) = (settings.geometric_share, 1.0 - settings.geometric_share);
         let (mut h, mut g) = (Matrix6::zeros(), Tangent::zeros());
         for r in &residuals {
-            let (wg, wp) = scales.weights(r);
-            // Park 2017, eq. (7): E = (1 - sigma) E_C + sigma E_G.
-            let wg = wg * geometric * depth_weight(r.sigma_m);
-            let wp = wp * photometric;
+            let (wg, wp) = scales.motion_weights(r, settings);
             h.syger(wg, &r.geometric_row, &r.geometric_row, 1.0);
             h.syger(wp, &r.photometric_row, &r.photometric_row, 1.0);
             g += r.geometric_row * (wg * r.geometric_m) + r.photometric_row * (wp * r.photometric);
@@ -287,8 +361,7 @@ pub fn refine_scale(
         }
         pose *= se3::exp(&step);
         pose.rotation.renormalize();
-        let small = CONVERGED_VOXELS * scale.voxel_m as f64;
-        if step.fixed_rows::<3>(0).norm() < small && step.fixed_rows::<3>(3).norm() < small {
+        if steps.settled_by(&step) {
             break;
         }
     }

@@ -6,7 +6,7 @@
 //! is a little off bend each part of the image its own way, and do not average out); and no standard deviation
 //! falls below a floor.
 
-use crate::icp::{Residual, Scales, depth_weight};
+use crate::icp::{Residual, Scales};
 use crate::settings::Settings;
 use coma_geometry::{Intrinsics, Matrix6, Tangent, se3};
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
@@ -40,7 +40,7 @@ impl Observability {
         let scales = Scales::of(residuals);
         let mut h = Matrix6::zeros();
         for r in residuals {
-            let (wg, wp) = motion_weights(r, &scales, settings);
+            let (wg, wp) = scales.shares(r, settings);
             h.syger(wg, &r.geometric_row, &r.geometric_row, 1.0);
             h.syger(wp, &r.photometric_row, &r.photometric_row, 1.0);
         }
@@ -67,19 +67,13 @@ impl Observability {
     }
 }
 
-/// Geometric and photometric weight of a residual in the sum that the motion was found with.
-fn motion_weights(residual: &Residual, scales: &Scales, settings: &Settings) -> (f64, f64) {
-    let (wg, wp) = scales.weights(residual);
-    (wg * settings.geometric_share * depth_weight(residual.sigma_m), wp * (1.0 - settings.geometric_share))
-}
-
 /// How far the motion would move if both focal lengths were longer, per unit of their logarithm: the Gauss-Newton
 /// step that the change of the residuals asks for. `None` if they do not pin the motion.
 pub fn focal_sensitivity(residuals: &[Residual], settings: &Settings) -> Option<Tangent> {
     let scales = Scales::of(residuals);
     let (mut h, mut g) = (Matrix6::zeros(), Tangent::zeros());
     for r in residuals {
-        let (wg, wp) = motion_weights(r, &scales, settings);
+        let (wg, wp) = scales.motion_weights(r, settings);
         h.syger(wg, &r.geometric_row, &r.geometric_row, 1.0);
         h.syger(wp, &r.photometric_row, &r.photometric_row, 1.0);
         g += r.geometric_row * (wg * r.by_focal.0) + r.photometric_row * (wp * r.by_focal.1);
@@ -143,7 +137,7 @@ impl Regional {
         let mut h = Matrix6::zeros();
         let mut gradients: BTreeMap<(i64, i64), Tangent> = BTreeMap::new();
         for r in residuals {
-            let (wg, wp) = motion_weights(r, scales, settings);
+            let (wg, wp) = scales.motion_weights(r, settings);
             h.syger(wg, &r.geometric_row, &r.geometric_row, 1.0);
             h.syger(wp, &r.photometric_row, &r.photometric_row, 1.0);
             if let Some(pixel) = camera.project(&r.source) {

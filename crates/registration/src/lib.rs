@@ -8,7 +8,7 @@
 //! 4. [`matching`]: mutual nearest neighbours among the features.
 //! 5. [`consensus`]: RANSAC over matches that keep distances and angles, several hypotheses.
 //! 6. [`icp`]: multi-scale coloured ICP (Park, Zhou, Koltun 2017), both directions in one system; or [`gicp`],
-//!    generalised ICP (Segal, Haehnel, Thrun 2009), where brightness says nothing.
+//!    generalised ICP (Segal, Haehnel, Thrun 2009), where brightness says nothing. Its last scale are the [`pixels`].
 //! 7. [`information`]: an information matrix that can be believed, and whether the scene pins all six degrees of freedom,
 //!    and pins them though the focal lengths are a little wrong.
 //! 8. [`verify`]: overlap, free-space conflicts and photometric agreement, broad and in [`detail`], at the found pose.
@@ -31,6 +31,7 @@ pub mod information;
 pub mod matching;
 pub mod neighbours;
 pub mod outcome;
+pub mod pixels;
 pub mod settings;
 pub mod verify;
 pub mod view;

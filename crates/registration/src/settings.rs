@@ -14,6 +14,26 @@ pub struct Scale {
     pub iterations: usize,
 }
 
+/// The finest scale of refinement: pixels instead of averages over voxels, found by projection instead of nearness.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PixelScale {
+    /// Most pixels of each view that look for a counterpart; 0 = refinement ends with the finest voxels.
+    pub points: usize,
+    /// They lie this far apart, metres: evenly over the surfaces, not over the picture, which shows more of what is near.
+    pub spacing_m: f32,
+    /// Pixels further apart than this never correspond, metres (widened to 3 sigma where depth is noisier).
+    pub max_correspondence_m: f32,
+    /// Most Gauss-Newton steps.
+    pub iterations: usize,
+}
+
+impl Default for PixelScale {
+    fn default() -> Self {
+        PixelScale { points: 10_000, spacing_m: 0.025, max_correspondence_m: 0.04, iterations: 8 }
+    }
+}
+
 /// What refines a coarse pose.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -70,11 +90,13 @@ pub struct Settings {
     pub geometric_share: f64,
     /// Most points of each cloud that look for a correspondence, per scale.
     pub icp_points: usize,
+    /// The last scale: both views pixel by pixel. None of its pixels if `points` is 0.
+    pub pixels: PixelScale,
     /// Fewer correspondences than this at the end are a divergence.
     pub min_correspondences: usize,
     /// Least share of the points seen by both views that must have a correspondence.
     pub min_fitness: f64,
-    /// Residuals within one block of this share of the image's width count as one sample (16 of 640 pixels).
+    /// Residuals within one block of this share of the image's width count as one sample (4 of 320 pixels).
     pub blocks_across: u32,
     /// Parts of the image's width that may each be wrong in their own way; the motion is as unsure as they disagree.
     pub regions_across: u32,
@@ -83,7 +105,7 @@ pub struct Settings {
     pub regional_scale: f64,
     /// Floor of the standard deviation of translation, metres.
     pub floor_m: f64,
-    /// Floor of the standard deviation of rotation, radians (0.005 degree).
+    /// Floor of the standard deviation of rotation, radians (0.0015 degree).
     pub floor_rad: f64,
     /// Least ratio of the Hessian's smallest to its largest eigenvalue, rotation measured at the points' radius.
     pub min_eigenvalue_ratio: f64,
@@ -136,13 +158,14 @@ impl Default for Settings {
             verified_hypotheses: 2,
             geometric_share: 0.94,
             icp_points: 2500,
+            pixels: PixelScale::default(),
             min_correspondences: 200,
             min_fitness: 0.3,
-            blocks_across: 40,
+            blocks_across: 80,
             regions_across: 4,
-            regional_scale: 1.28,
-            floor_m: 0.0001,
-            floor_rad: 0.005_f64.to_radians(),
+            regional_scale: 1.0,
+            floor_m: 0.00003,
+            floor_rad: 0.0015_f64.to_radians(),
             min_eigenvalue_ratio: 0.004,
             weak_ratio: 0.05,
             focal_uncertainty: 0.03,
