@@ -6,7 +6,7 @@ use crate::source;
 use anyhow::{Context, ensure};
 use clap::Args;
 use coma_dataset::Sequence;
-use coma_geometry::{Matrix6, Pose, Tangent, se3};
+use coma_geometry::{Pose, Tangent, se3};
 use coma_registration::{
     Alignment, Outcome, Prepared, Reason, Settings, Side, View, align_prepared, coarse, decide,
 };
@@ -108,7 +108,7 @@ struct Class {
     /// Root mean squares.
     rms_cm: Option<f64>,
     rms_deg: Option<f64>,
-    /// Those that are not wrong.
+    /// All accepted ones; the figures above leave out those that are wrong.
     edges: Vec<EdgeError>,
 }
 
@@ -118,16 +118,17 @@ struct EdgeError {
     source: String,
     target: String,
     true_overlap: f64,
+    wrong: bool,
     /// `log(truth^-1 * found)`: metres, then radians.
     error: Tangent,
-    information: Matrix6,
-    effective_samples: usize,
+    /// What registration said of it.
+    found: Box<Alignment>,
 }
 
 impl EdgeError {
     /// By the claimed information.
     fn squared(&self) -> f64 {
-        (self.error.transpose() * self.information * self.error)[0]
+        (self.error.transpose() * self.found.information * self.error)[0]
     }
 }
 
@@ -369,7 +370,8 @@ fn sweep(
             class.accepted += 1;
             let truth = source.sight.motion_to(&target.sight);
             let (m, deg, is_far) = error(&truth, &found.target_from_source);
-            if shared < 0.01 || is_far {
+            let wrong = shared < 0.01 || is_far;
+            if wrong {
                 class.wrong += 1;
                 class.wrong_pairs.push(format!(
                     "{} and {}: {deg:.1} degrees, {:.1} cm",
@@ -379,23 +381,26 @@ fn sweep(
                 ));
             } else {
                 class.success += succeeds(m, deg) as usize;
-                class.edges.push(EdgeError {
-                    source: source.name.clone(),
-                    target: target.name.clone(),
-                    true_overlap: shared,
-                    error: se3::log(&truth.inv_mul(&found.target_from_source)),
-                    information: found.information,
-                    effective_samples: found.effective_samples,
-                });
             }
+            class.edges.push(EdgeError {
+                source: source.name.clone(),
+                target: target.name.clone(),
+                true_overlap: shared,
+                wrong,
+                error: se3::log(&truth.inv_mul(&found.target_from_source)),
+                found,
+            });
         }
     }
     progress.finish_and_clear();
-    for class in classes.iter_mut().filter(|c| !c.edges.is_empty()) {
-        let squared: Vec<f64> = class.edges.iter().map(EdgeError::squared).collect();
-        let mean = |of: &dyn Fn(&EdgeError) -> f64| {
-            class.edges.iter().map(of).sum::<f64>() / class.edges.len() as f64
-        };
+    for class in &mut classes {
+        let right: Vec<&EdgeError> = class.edges.iter().filter(|e| !e.wrong).collect();
+        if right.is_empty() {
+            continue;
+        }
+        let squared: Vec<f64> = right.iter().map(|e| e.squared()).collect();
+        let mean =
+            |of: &dyn Fn(&EdgeError) -> f64| right.iter().map(|e| of(e)).sum::<f64>() / right.len() as f64;
         class.rms_cm = Some(100.0 * mean(&|e| e.error.fixed_rows::<3>(0).norm_squared()).sqrt());
         class.rms_deg = Some(mean(&|e| e.error.fixed_rows::<3>(3).norm_squared()).sqrt().to_degrees());
         class.mean_squared_error = Some(mean(&EdgeError::squared));

@@ -121,7 +121,9 @@ pub struct Settings {
     pub depth_tolerance_sigmas: f32,
     /// Least share of a view's points that the other must see at its own depth (the lesser direction).
     pub min_overlap: f64,
-    /// Largest share of points, of those in agreement or conflict, that float in the other's free space.
+    /// Largest share of points, of those in agreement or conflict, that float in the other's free space. Right motions
+    /// have none in a rendered room, at most 0.005 with the built-in world's noisy sensor, and nine of ten of a real
+    /// kitchen's have less than 0.026; those that are off by 10 cm there have 0.02 to 0.07.
     pub max_conflict: f64,
     /// Least zero-mean normalised correlation of the intensities of agreeing points.
     pub min_correlation: f64,
@@ -173,7 +175,7 @@ impl Default for Settings {
             depth_tolerance_m: 0.02,
             depth_tolerance_sigmas: 3.0,
             min_overlap: 0.2,
-            max_conflict: 0.08,
+            max_conflict: 0.028,
             min_correlation: 0.6,
             min_detail_correlation: 0.27,
             min_contrast: 0.03,
