@@ -175,7 +175,7 @@ impl Default for Settings {
             depth_tolerance_m: 0.02,
             depth_tolerance_sigmas: 3.0,
             min_overlap: 0.2,
-            max_conflict: 0.028,
+            max_conflict: 0.03,
             min_correlation: 0.6,
             min_detail_correlation: 0.27,
             min_contrast: 0.03,
