@@ -143,7 +143,7 @@ impl Default for Settings {
             scales: vec![
                 Scale { voxel_m: 0.05, max_correspondence_m: 0.15, iterations: 15 },
                 Scale { voxel_m: 0.025, max_correspondence_m: 0.07, iterations: 15 },
-                Scale { voxel_m: 0.0125, max_correspondence_m: 0.04, iterations: 12 },
+                Scale { voxel_m: 0.0175, max_correspondence_m: 0.04, iterations: 12 },
             ],
             feature_radius_voxels: 5.0,
             feature_neighbours: 100,
