@@ -69,7 +69,8 @@ pub fn fuse(
     let brightness = brightness.gain as f32;
     let rotation = camera_from_submap.rotation.to_rotation_matrix().matrix().cast::<f32>();
     let translation: Vector3<f32> = camera_from_submap.translation.vector.cast();
-    let level = &view.levels[0];
+    // Half the resolution: depth of four pixels averaged.
+    let level = &view.levels[1.min(view.levels.len() - 1)];
     let camera = &level.camera;
     let (fx, fy, cx, cy) = (camera.fx as f32, camera.fy as f32, camera.cx as f32, camera.cy as f32);
     let one = |center: &mut [f32; 3], turn: &mut [f32; 4], variance: &mut f32, intensity: &mut f32| {

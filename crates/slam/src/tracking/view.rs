@@ -10,6 +10,8 @@ use std::sync::Arc;
 pub const DEPTH_JUMP: f32 = 0.05;
 /// Pixels next to a depth jump that are not trusted.
 const JUMP_MARGIN_PX: usize = 2;
+/// Normals need a base that is wide against the sensor's noise.
+const NORMAL_STEP_PX: usize = 2;
 /// Nearer points are not looked at, metres.
 const NEAR_M: f32 = 0.05;
 /// Surfaces seen under more than 75 degrees from their normal are not trusted.
@@ -90,9 +92,7 @@ impl TrackingView {
             }
             // The depth of an inclined surface changes more from one coarse pixel to the next.
             let jump = DEPTH_JUMP * (1 << level) as f32;
-            // Fine levels of a noisy sensor need a wider base for their normals.
-            let step = if level == 0 { 2 } else { 1 };
-            let mut normal = normals::normals_from_depth(&depth_m, &camera, jump, step);
+            let mut normal = normals::normals_from_depth(&depth_m, &camera, jump, NORMAL_STEP_PX);
             drop_grazing(&mut normal, &camera);
             let margin = if level == 0 { JUMP_MARGIN_PX } else { 1 };
             let trusted = away_from_jumps(&depth_m, jump, margin);
