@@ -84,7 +84,8 @@ pub fn decide(
         }
     }
     hypotheses.sort_by(|a, b| b.score.total_cmp(&a.score));
-    let pixels = both_pixels(source, target, settings);
+    let pixels = pixel_scales(source, target, settings);
+    let clouds = BothClouds::new(source, target, &pixels, settings);
     let mut best: Option<(f64, Alignment)> = None;
     let mut first_reason = None;
     for hypothesis in distinct(hypotheses).iter().take(settings.verified_hypotheses.max(1)) {
@@ -92,7 +93,7 @@ pub fn decide(
         if best.as_ref().is_some_and(|b| hypothesis.score < 0.8 * b.0) {
             break;
         }
-        match judged(source, target, pixels.as_ref(), hypothesis, settings) {
+        match judged(source, target, &clouds, hypothesis, settings) {
             Ok((score, alignment)) => {
                 if best.as_ref().is_none_or(|b| score > b.0) {
                     best = Some((score, alignment));
@@ -127,11 +128,11 @@ fn distinct(hypotheses: Vec<Hypothesis>) -> Vec<Hypothesis> {
 fn judged(
     source: &Prepared,
     target: &Prepared,
-    pixels: Option<&(Pixels, Pixels)>,
+    clouds: &BothClouds,
     hypothesis: &Hypothesis,
     settings: &Settings,
 ) -> Result<(f64, Alignment), Reason> {
-    let refined = refine_with(source, target, pixels, &hypothesis.target_from_source, settings)?;
+    let refined = refine_with(source, clouds, &hypothesis.target_from_source, settings)?;
     let evidence = verify::verify(source, target, &refined.target_from_source, settings)?;
     if !(refined.calibration_m <= settings.max_calibration_m) {
         let (metres, allowed) = (refined.calibration_m, settings.max_calibration_m);
@@ -191,20 +192,42 @@ pub fn refine(
     initial: &Pose,
     settings: &Settings,
 ) -> Result<Refined, Reason> {
-    let pixels = both_pixels(source, target, settings);
-    refine_with(source, target, pixels.as_ref(), initial, settings)
+    let pixels = pixel_scales(source, target, settings);
+    refine_with(source, &BothClouds::new(source, target, &pixels, settings), initial, settings)
 }
 
-/// Both views' points of the pixel scale, if there is one.
-fn both_pixels(source: &Prepared, target: &Prepared, settings: &Settings) -> Option<(Pixels, Pixels)> {
-    let of = |view: &Prepared| Pixels::new(view, settings.depth_jump, &settings.pixels);
-    (settings.pixels.points > 0).then(|| (of(source), of(target)))
+/// Both views' points of the pixel scales.
+fn pixel_scales(source: &Prepared, target: &Prepared, settings: &Settings) -> Vec<(Pixels, Pixels)> {
+    let of = |view: &Prepared, scale| Pixels::new(view, settings.depth_jump, scale);
+    settings.pixels.iter().map(|scale| (of(source, scale), of(target, scale))).collect()
+}
+
+/// Both clouds of every scale, coarse to fine: made once, for all hypotheses.
+struct BothClouds<'a>(Vec<(Searchable<'a>, Searchable<'a>, Steps)>);
+
+impl<'a> BothClouds<'a> {
+    fn new(
+        source: &'a Prepared,
+        target: &'a Prepared,
+        pixels: &'a [(Pixels, Pixels)],
+        settings: &Settings,
+    ) -> Self {
+        let voxels = settings.scales.iter().enumerate().map(|(level, scale)| {
+            let (s, t) = searchable(source, target, level, settings.icp_points);
+            (s, t, Steps::from(scale))
+        });
+        let pixels = pixels.iter().zip(&settings.pixels).map(|((s, t), scale)| {
+            let (s, t) =
+                (Searchable::by_projection(s, source.noise), Searchable::by_projection(t, target.noise));
+            (s, t, Steps::from(scale))
+        });
+        BothClouds(voxels.chain(pixels).collect())
+    }
 }
 
 fn refine_with(
     source: &Prepared,
-    target: &Prepared,
-    pixels: Option<&(Pixels, Pixels)>,
+    clouds: &BothClouds,
     initial: &Pose,
     settings: &Settings,
 ) -> Result<Refined, Reason> {
@@ -213,27 +236,20 @@ fn refine_with(
     let mut pose = *initial;
     let mut observability = None;
     let mut residuals = Vec::new();
-    let mut at_scale = |s: &Searchable, t: &Searchable, steps: &Steps| {
+    for (level, (s, t, steps)) in clouds.0.iter().enumerate() {
         pose = refine_scale(s, t, &pose, steps, settings).ok_or(diverged(0))?;
-        let mut residuals = icp::linearise(s, t, &pose, steps.max_correspondence_m);
-        if settings.refiner == Refiner::Generalised {
-            // What the refiner did not look at pins nothing.
-            residuals.iter_mut().for_each(icp::Residual::forget_brightness);
+        // The first scale judges what the scene pins: normals and gradients are calmest there, their noise looks like
+        // structure. The last one gives the information.
+        if level == 0 || level + 1 == clouds.0.len() {
+            residuals = icp::linearise(s, t, &pose, steps.max_correspondence_m);
+            if settings.refiner == Refiner::Generalised {
+                // What the refiner did not look at pins nothing.
+                residuals.iter_mut().for_each(icp::Residual::forget_brightness);
+            }
         }
-        Ok(residuals)
-    };
-    for (level, scale) in settings.scales.iter().enumerate() {
-        let (s, t) = searchable(source, target, level, settings.icp_points);
-        residuals = at_scale(&s, &t, &Steps::from(scale))?;
         if level == 0 {
-            // Judged where normals and gradients are calmest: their noise looks like structure.
             observability = Observability::new(&residuals, settings);
         }
-    }
-    if let Some((source_pixels, target_pixels)) = pixels {
-        let s = Searchable::by_projection(source_pixels, source.noise);
-        let t = Searchable::by_projection(target_pixels, target.noise);
-        residuals = at_scale(&s, &t, &Steps::from(&settings.pixels))?;
     }
     let floor = settings.min_eigenvalue_ratio;
     let Some(observability) = observability else {

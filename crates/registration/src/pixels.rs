@@ -1,16 +1,17 @@
-//! Every pixel of a view as a point that is found by projection: the finest scale of refinement. Averages over voxels
+//! Every pixel of a view as a point that is found by projection: the last scales of refinement. Averages over voxels
 //! cut corners by a share of their side; pixels don't.
 
 use crate::cloud::{PointCloud, voxel};
 use crate::icp::evenly;
 use crate::settings::PixelScale;
 use crate::view::Prepared;
-use coma_frame::{Image, normals::normal_at};
+use coma_frame::{Image, normals::normal_at, pyramid};
 use coma_geometry::Intrinsics;
 use nalgebra::{Point3, Vector3};
+use std::borrow::Cow;
 
-/// Pixels to either side over which normals and gradients are taken.
-const STEP_PX: usize = 2;
+/// Most times that a picture is halved.
+const MOST_HALVINGS: u32 = 4;
 /// Surfaces seen under more than 75 degrees from their normal are left out: depth is poor there.
 const GRAZING_COS: f32 = 0.2588;
 /// No point lies at this pixel.
@@ -31,7 +32,18 @@ pub struct Pixels {
 impl Pixels {
     /// Pixels that lie on a surface: all but those near a depth jump (relative) and those seen from the side.
     pub fn new(view: &Prepared, jump: f32, scale: &PixelScale) -> Self {
-        let Prepared { depth_m, intensity, camera, .. } = view;
+        let (mut depth_m, mut intensity, mut camera) =
+            (Cow::Borrowed(&view.depth_m), Cow::Borrowed(&view.intensity), view.camera);
+        let halvings = scale.halvings.min(MOST_HALVINGS);
+        for _ in 0..halvings {
+            depth_m = Cow::Owned(pyramid::halve_depth(&depth_m, jump));
+            intensity = Cow::Owned(pyramid::halve(&intensity));
+            camera = camera.halved();
+        }
+        // Pixels to either side over which normals and gradients are taken: halved pictures are calmer.
+        let step = if halvings == 0 { 2 } else { 1 };
+        // The depth of an inclined surface changes more from one coarse pixel to the next.
+        let jump = jump * (1 << halvings) as f32;
         let (width, height) = (depth_m.width(), depth_m.height());
         let mut index = Image::filled(width, height, NONE);
         let mut cloud = PointCloud::default();
@@ -40,13 +52,12 @@ impl Pixels {
         };
         for y in 0..height {
             for x in 0..width {
-                let Some(normal) = normal_at(depth_m, camera, jump, STEP_PX, x, y) else { continue };
+                let Some(normal) = normal_at(&depth_m, &camera, jump, step, x, y) else { continue };
                 let (p, normal) = (point(x, y), Vector3::from(normal));
                 if !(-normal.dot(&p.coords) >= GRAZING_COS * p.coords.norm()) {
                     continue;
                 }
-                let (left, right, up, down) =
-                    ((x - STEP_PX, y), (x + STEP_PX, y), (x, y - STEP_PX), (x, y + STEP_PX));
+                let (left, right, up, down) = ((x - step, y), (x + step, y), (x, y - step), (x, y + step));
                 let across = point(right.0, right.1) - point(left.0, left.1);
                 let along = point(down.0, down.1) - point(up.0, up.1);
                 // The vector g of the tangent plane with g . across and g . along as the picture has them.
@@ -61,7 +72,7 @@ impl Pixels {
             }
         }
         let queries = evenly(&one_per_voxel(&cloud.points, scale.spacing_m), scale.points);
-        Pixels { cloud, camera: *camera, index, queries }
+        Pixels { cloud, camera, index, queries }
     }
 
     /// The point at the pixel where another one of this camera's frame is seen, if it lies within `reach_m`.
@@ -118,9 +129,17 @@ mod tests {
         Prepared::new(&view, &Settings::default(), Side::Source).unwrap()
     }
 
+    const SCALE: PixelScale = PixelScale {
+        halvings: 0,
+        points: 10_000,
+        spacing_m: 0.025,
+        max_correspondence_m: 0.04,
+        iterations: 8,
+    };
+
     #[test]
     fn normals_and_gradients_are_those_of_the_surface() {
-        let pixels = Pixels::new(&view(), 0.05, &PixelScale::default());
+        let pixels = Pixels::new(&view(), 0.05, &SCALE);
         let normal = Vector3::new(0.3, 0.0, -1.0).normalize();
         // The change of intensity along the wall: that in space without its part along the normal.
         let in_space = Vector3::new(0.1, 0.05, 0.0);
@@ -135,7 +154,7 @@ mod tests {
 
     #[test]
     fn a_point_is_found_at_its_pixel_and_not_beyond_the_reach_or_near_the_jump() {
-        let pixels = Pixels::new(&view(), 0.05, &PixelScale::default());
+        let pixels = Pixels::new(&view(), 0.05, &SCALE);
         let p = pixels.cloud.points[pixels.cloud.len() / 2];
         let found = pixels.at(&(p + Vector3::new(0.001, -0.001, 0.0)), 0.01).unwrap();
         assert_eq!(pixels.cloud.points[found], p);
@@ -146,9 +165,24 @@ mod tests {
     }
 
     #[test]
+    fn halved_pictures_show_the_same_surfaces() {
+        let view = view();
+        let halved = Pixels::new(&view, 0.05, &PixelScale { halvings: 1, ..SCALE });
+        assert_eq!(halved.camera, view.camera.halved());
+        let whole = Pixels::new(&view, 0.05, &SCALE);
+        let share = halved.cloud.len() as f64 / whole.cloud.len() as f64;
+        assert!(share > 0.2 && share < 0.3, "{share}");
+        for p in halved.cloud.points.iter().filter(|p| p.z > 1.5) {
+            assert!((p.x * 0.3 - p.z + 2.0).abs() < 2e-3, "{p}");
+        }
+        // What a file of settings may ask for at most.
+        Pixels::new(&view, 0.05, &PixelScale { halvings: u32::MAX, ..SCALE });
+    }
+
+    #[test]
     fn those_that_ask_lie_in_different_voxels_and_are_no_more_than_allowed() {
         let view = view();
-        let scale = PixelScale { spacing_m: 0.05, ..PixelScale::default() };
+        let scale = PixelScale { spacing_m: 0.05, ..SCALE };
         let pixels = Pixels::new(&view, 0.05, &scale);
         let mut voxels: Vec<u64> =
             pixels.queries.iter().map(|&i| voxel(&pixels.cloud.points[i as usize], 0.05)).collect();

@@ -14,11 +14,13 @@ pub struct Scale {
     pub iterations: usize,
 }
 
-/// The finest scale of refinement: pixels instead of averages over voxels, found by projection instead of nearness.
+/// One of the last scales of refinement: pixels instead of averages over voxels, found by projection instead of nearness.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
+#[serde(deny_unknown_fields)]
 pub struct PixelScale {
-    /// Most pixels of each view that look for a counterpart; 0 = refinement ends with the finest voxels.
+    /// How often both pictures are halved, from the working size on; at most 4. Halved ones draw a motion in from farther away.
+    pub halvings: u32,
+    /// Most pixels of each view that look for a counterpart.
     pub points: usize,
     /// They lie this far apart, metres: evenly over the surfaces, not over the picture, which shows more of what is near.
     pub spacing_m: f32,
@@ -26,12 +28,6 @@ pub struct PixelScale {
     pub max_correspondence_m: f32,
     /// Most Gauss-Newton steps.
     pub iterations: usize,
-}
-
-impl Default for PixelScale {
-    fn default() -> Self {
-        PixelScale { points: 10_000, spacing_m: 0.025, max_correspondence_m: 0.04, iterations: 8 }
-    }
 }
 
 /// What refines a coarse pose.
@@ -90,8 +86,8 @@ pub struct Settings {
     pub geometric_share: f64,
     /// Most points of each cloud that look for a correspondence, per scale.
     pub icp_points: usize,
-    /// The last scale: both views pixel by pixel. None of its pixels if `points` is 0.
-    pub pixels: PixelScale,
+    /// The scales after those, coarse to fine: both views pixel by pixel. None: refinement ends with the finest voxels.
+    pub pixels: Vec<PixelScale>,
     /// Fewer correspondences than this at the end are a divergence.
     pub min_correspondences: usize,
     /// Least share of the points seen by both views that must have a correspondence.
@@ -160,7 +156,13 @@ impl Default for Settings {
             verified_hypotheses: 2,
             geometric_share: 0.94,
             icp_points: 2500,
-            pixels: PixelScale::default(),
+            pixels: vec![PixelScale {
+                halvings: 0,
+                points: 10_000,
+                spacing_m: 0.025,
+                max_correspondence_m: 0.04,
+                iterations: 8,
+            }],
             min_correspondences: 200,
             min_fitness: 0.3,
             blocks_across: 80,

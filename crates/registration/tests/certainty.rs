@@ -63,8 +63,7 @@ fn so_they_are_with_a_noisy_sensor() {
 }
 
 /// Median error of neighbours in time, refined from 2 cm and half a degree beside the truth, metres.
-fn refined_error_m(views: &[(Prepared, Pose)], points: usize) -> f64 {
-    let pixels = PixelScale { points, ..PixelScale::default() };
+fn refined_error_m(views: &[(Prepared, Pose)], pixels: Vec<PixelScale>) -> f64 {
     let settings = Settings { pixels, ..Settings::default() };
     let beside = se3::exp(&Tangent::new(0.01, -0.015, 0.01, 0.004, 0.006, -0.004));
     let mut errors = Vec::new();
@@ -85,7 +84,7 @@ fn pixels_meet_where_averages_over_voxels_miss() {
     for (noise, most) in [(None, 0.8), (Some(SensorNoise::default()), 0.5)] {
         let views = views(noise);
         let (voxels_m, pixels_m) =
-            (refined_error_m(&views, 0), refined_error_m(&views, PixelScale::default().points));
+            (refined_error_m(&views, Vec::new()), refined_error_m(&views, Settings::default().pixels));
         println!("voxels {:.3} mm, pixels {:.3} mm", 1e3 * voxels_m, 1e3 * pixels_m);
         assert!(pixels_m < most * voxels_m, "{voxels_m} and {pixels_m}");
     }
