@@ -295,7 +295,7 @@ pub fn depth_weight(sigma_m: f64) -> f64 {
 
 /// A voxel scale has settled when a step is below this many voxels (and as many radians per metre).
 const SETTLED_VOXELS: f64 = 0.01;
-/// A pixel scale has when it is below this, metres; four times that where both pictures are halved.
+/// A pixel scale has when it is below this, metres; four times that for every halving of the pictures.
 const SETTLED_PIXELS_M: f64 = 1e-5;
 
 /// What Gauss-Newton needs to know of a scale.
@@ -325,8 +325,8 @@ impl From<&Scale> for Steps {
 
 impl From<&PixelScale> for Steps {
     fn from(scale: &PixelScale) -> Self {
-        let PixelScale { halvings, max_correspondence_m, iterations, .. } = *scale;
-        let settled = SETTLED_PIXELS_M * 4f64.powi(halvings.min(4) as i32);
+        let PixelScale { max_correspondence_m, iterations, .. } = *scale;
+        let settled = SETTLED_PIXELS_M * 4f64.powi(scale.bounded_halvings() as i32);
         Steps { max_correspondence_m, iterations, settled }
     }
 }

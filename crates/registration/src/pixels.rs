@@ -10,8 +10,6 @@ use coma_geometry::Intrinsics;
 use nalgebra::{Point3, Vector3};
 use std::borrow::Cow;
 
-/// Most times that a picture is halved.
-const MOST_HALVINGS: u32 = 4;
 /// Surfaces seen under more than 75 degrees from their normal are left out: depth is poor there.
 const GRAZING_COS: f32 = 0.2588;
 /// No point lies at this pixel.
@@ -34,7 +32,7 @@ impl Pixels {
     pub fn new(view: &Prepared, jump: f32, scale: &PixelScale) -> Self {
         let (mut depth_m, mut intensity, mut camera) =
             (Cow::Borrowed(&view.depth_m), Cow::Borrowed(&view.intensity), view.camera);
-        let halvings = scale.halvings.min(MOST_HALVINGS);
+        let halvings = scale.bounded_halvings();
         for _ in 0..halvings {
             depth_m = Cow::Owned(pyramid::halve_depth(&depth_m, jump));
             intensity = Cow::Owned(pyramid::halve(&intensity));

@@ -30,6 +30,13 @@ pub struct PixelScale {
     pub iterations: usize,
 }
 
+impl PixelScale {
+    /// How often pictures are halved, whatever a file of settings says.
+    pub(crate) fn bounded_halvings(&self) -> u32 {
+        self.halvings.min(4)
+    }
+}
+
 /// What refines a coarse pose.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
