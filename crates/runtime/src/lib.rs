@@ -36,3 +36,8 @@ pub use secret::Secret;
 pub use server::{Bound, Handle, ServeError, ServerSettings, Services};
 pub use tls::{ClientTls, ServerTls};
 pub use tokio_util::sync::CancellationToken;
+
+/// Every frame takes and frees pictures of some megabytes. The system's allocator hands them back to the kernel each
+/// time and gets them as zeroed pages again; this one keeps them for a moment.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
