@@ -8,8 +8,17 @@ use std::path::Path;
 /// The project's test command, as the README gives it and `.ci/run` runs it.
 pub const TEST_COMMAND: &[&str] = &["cargo", "test", "--release", "--workspace"];
 
-const CLIPPY: &[&str] =
-    &["cargo", "clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"];
+const CLIPPY: &[&str] = &[
+    "cargo",
+    "clippy",
+    "--release",
+    "--workspace",
+    "--all-targets",
+    "--all-features",
+    "--",
+    "-D",
+    "warnings",
+];
 
 /// Runs every step; the first that fails ends the run.
 pub fn run(root: &Path) -> Result<()> {

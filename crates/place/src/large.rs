@@ -21,9 +21,15 @@ const ROOM: usize = 4096;
 /// Approximate search: a query looks at a small part of the descriptors, and may miss some of the nearest. The laws
 /// of [`Index`] hold but for two: hits are the nearest of those that were found, and the order of insertion decides
 /// which these are. The same insertions in the same order give the same answers.
-#[derive(Default)]
 pub struct LargeIndex<K> {
     blocks: BTreeMap<(Space, usize), Block<K>>,
+}
+
+// Derived, it would ask keys for a default too.
+impl<K> Default for LargeIndex<K> {
+    fn default() -> Self {
+        LargeIndex { blocks: BTreeMap::new() }
+    }
 }
 
 /// All descriptors of one space and dimension.
