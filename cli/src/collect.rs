@@ -71,10 +71,7 @@ impl AgentCalls {
             while let Some(message) = stream.message().await.map_err(plain)? {
                 packed.extend_from_slice(&message.chunk);
             }
-            let packed_bytes = packed.len() as u64;
-            let surfels =
-                coma_surfel::pack::unpack(&packed, MAX_SURFELS).with_context(|| format!("submap {id}"))?;
-            out.push(Submap { id, map_from_submap, packed_bytes, surfels });
+            out.push(Submap { id, map_from_submap, packed });
         }
         Ok(out)
     }
@@ -90,10 +87,20 @@ pub struct Submap {
     pub id: SubmapId,
     /// Where it lies.
     pub map_from_submap: Pose,
+    /// As [`coma_surfel::pack`] has them: a long run's surfels are many.
+    packed: Vec<u8>,
+}
+
+impl Submap {
     /// Packed size.
-    pub packed_bytes: u64,
+    pub fn packed_bytes(&self) -> u64 {
+        self.packed.len() as u64
+    }
+
     /// In its own frame.
-    pub surfels: SurfelCloud,
+    pub fn surfels(&self) -> anyhow::Result<SurfelCloud> {
+        coma_surfel::pack::unpack(&self.packed, MAX_SURFELS).with_context(|| format!("submap {}", self.id))
+    }
 }
 
 /// Waits until every candidate has a verdict, all logs are equal, and the graph is solved; `say` is told what is

@@ -25,6 +25,56 @@ fn take(agent: &mut Agent, frame: &Arc<RgbdFrame>) -> FrameOutcome {
     agent.on_frame(frame.clone(), FrameOptions::default())
 }
 
+/// How far the position lies from the truth, metres, both relative to frame 0.
+fn metres_off(sequence: &dyn Sequence, index: usize, outcome: &FrameOutcome) -> f64 {
+    let truth = |index| sequence.truth(index).unwrap();
+    let found = &outcome.pose.as_ref().unwrap().agent_from_camera;
+    se3::distance(&truth(0).inv_mul(&truth(index)), found).0
+}
+
+#[test]
+fn pictures_of_96x72_pixels_are_enough() {
+    let world = WorldSettings {
+        agents: 1,
+        frames: 150,
+        width: 96,
+        height: 72,
+        noise: None,
+        ..WorldSettings::default()
+    };
+    let sequence = World::new(world).unwrap().sequence(0).unwrap();
+    let mut agent = agent();
+    for index in 0..150 {
+        let outcome = take(&mut agent, &Arc::new(rgbd_frame(&sequence, index).unwrap()));
+        assert_eq!(outcome.state, State::Tracking, "frame {index}");
+        let off_m = metres_off(&sequence, index, &outcome);
+        assert!(off_m < 0.02, "frame {index}: {off_m} m off");
+    }
+}
+
+#[test]
+fn closed_submaps_stay_within_their_budget_of_memory() {
+    let frames = frames(120, 96, None);
+    let most_bytes = |resident_budget_mb: f64| {
+        let mut settings = SlamSettings::default();
+        settings.tracking.resident_budget_mb = resident_budget_mb;
+        let mut agent = Agent::new(AgentId::new("a").unwrap(), Epoch(1), None, settings);
+        let taken = frames.iter().map(|frame| {
+            assert_eq!(take(&mut agent, frame).state, State::Tracking);
+            agent.closed_bytes()
+        });
+        taken.max().unwrap()
+    };
+    let free = most_bytes(f64::INFINITY);
+    // Enough for the last one, which always stays.
+    let budget_mb = 0.9e-6 * free as f64;
+    let bound = most_bytes(budget_mb);
+    assert!(
+        bound > 0 && bound as f64 <= budget_mb * 1e6,
+        "{bound} of {budget_mb} MB, {free} without a budget"
+    );
+}
+
 /// A covered lens.
 fn black(frame: &RgbdFrame) -> Arc<RgbdFrame> {
     let (width, height) = (frame.depth_m.width(), frame.depth_m.height());

@@ -6,8 +6,9 @@ use coma_evaluation::{SentBytes, TrafficClass};
 use coma_geometry::{Pose, StampNs, SubmapId};
 use coma_slam::log::{EntryKey, LoopOutcome, Payload};
 use coma_surfel::SurfelCloud;
-use coma_surfel::merge::{MergeSettings, Part, merge_counted};
+use coma_surfel::merge::{MergeSettings, merge_each};
 use coma_wire::{At, Wire, v1};
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 
 /// What one agent gave.
@@ -55,16 +56,15 @@ pub fn gather(
     let anchors = anchors(facts, &entries, stamps);
     for (i, from) in from_agents.iter().enumerate() {
         poses(facts, &mut results, i, &from.poses, &stamps[i], &mut component_of)?;
-        agent(&mut facts.agents[i], from, &component_of, &anchors);
+        agent(&mut facts.agents[i], from, &component_of, &anchors)?;
     }
     let mut submaps: Vec<&Submap> = from_agents.iter().flat_map(|f| &f.submaps).collect();
     submaps.sort_by(|a, b| a.id.cmp(&b.id));
     for (index, component) in facts.components.iter_mut().enumerate() {
         let mine = submaps.iter().copied().filter(|s| component_of.get(&s.id) == Some(&index));
         let mine: Vec<&Submap> = mine.collect();
-        let parts: Vec<Part> =
-            mine.iter().map(|s| Part { surfels: &s.surfels, map_from_submap: s.map_from_submap }).collect();
-        let (map, kept) = merge_counted(&parts, &MergeSettings::default());
+        let part = |i: usize| anyhow::Ok((Cow::Owned(mine[i].surfels()?), mine[i].map_from_submap));
+        let (map, kept) = merge_each(mine.len(), part, &MergeSettings::default())?;
         let kept: BTreeMap<&SubmapId, usize> = mine.iter().map(|s| &s.id).zip(kept).collect();
         for submap in facts.agents.iter_mut().flat_map(|a| &mut a.submaps) {
             if let Some(kept) = kept.get(&submap.id) {
@@ -255,7 +255,7 @@ fn agent(
     from: &FromAgent,
     component_of: &BTreeMap<SubmapId, usize>,
     anchors: &BTreeMap<SubmapId, usize>,
-) {
+) -> anyhow::Result<()> {
     facts.dropped = from.status.frames_dropped;
     facts.encoder = from.status.encoder.clone();
     facts.warnings = from.status.warnings.clone();
@@ -276,15 +276,18 @@ fn agent(
     facts.submaps = from
         .submaps
         .iter()
-        .map(|s| SubmapFacts {
-            id: s.id.clone(),
-            anchor_frame: anchors.get(&s.id).copied(),
-            component: component_of.get(&s.id).copied(),
-            surfels: s.surfels.len(),
-            packed_bytes: s.packed_bytes,
-            merged_surfels: None,
+        .map(|s| {
+            Ok(SubmapFacts {
+                id: s.id.clone(),
+                anchor_frame: anchors.get(&s.id).copied(),
+                component: component_of.get(&s.id).copied(),
+                surfels: s.surfels()?.len(),
+                packed_bytes: s.packed_bytes(),
+                merged_surfels: None,
+            })
         })
-        .collect();
+        .collect::<anyhow::Result<_>>()?;
+    Ok(())
 }
 
 /// What the solver made of each accepted loop: weight, and a sentence where it is not used.

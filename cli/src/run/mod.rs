@@ -161,18 +161,29 @@ impl Run {
         self.facts.cpu_s = cpu.zip(cpu_seconds()).map(|(before, after)| after - before);
         self.facts.finished = rfc3339(SystemTime::now());
 
-        let mut from_agents = Vec::new();
-        for call in &mut calls {
-            from_agents.push(gather::ask(call).await?);
-        }
-        let graph = calls.first_mut().context("no agents")?.graph().await?;
-        let results = gather::gather(&mut self.facts, &from_agents, &graph, &stamps)?;
-        folder::write(out, &self.facts, &results, &texts)?;
+        self.write(&mut calls, &stamps, &texts, out).await?;
         eval::score(
             out,
             &eval::Options { lpips_model: options.lpips_model.clone(), ..eval::Options::default() },
         )
         .await
+    }
+
+    /// Writes what the agents know, all of which is let go again.
+    async fn write(
+        &mut self,
+        calls: &mut [AgentCalls],
+        stamps: &[Vec<StampNs>],
+        texts: &[Vec<String>],
+        out: &Path,
+    ) -> anyhow::Result<()> {
+        let mut from_agents = Vec::new();
+        for call in &mut *calls {
+            from_agents.push(gather::ask(call).await?);
+        }
+        let graph = calls.first_mut().context("no agents")?.graph().await?;
+        let results = gather::gather(&mut self.facts, &from_agents, &graph, stamps)?;
+        folder::write(out, &self.facts, &results, texts)
     }
 
     async fn stream_all(&mut self, options: &Options) -> anyhow::Result<Vec<Streamed>> {

@@ -134,6 +134,14 @@ pub struct Recent {
     pub agent_from_submap: Pose,
 }
 
+impl Recent {
+    /// Memory that its surfels take.
+    pub fn bytes(&self) -> usize {
+        let intensity = self.intensity.as_ref().map_or(0, |values| size_of_val(values.as_slice()));
+        self.surfels.len() * SurfelCloud::SURFEL_BYTES + intensity
+    }
+}
+
 /// Where an earlier life of this agent ended.
 #[derive(Clone, Debug)]
 pub struct Resume {
@@ -196,6 +204,11 @@ impl Agent {
     /// The submap under work: id, revision and surfels.
     pub fn active_submap(&self) -> Option<(&SubmapId, u64, &SurfelCloud)> {
         self.active.as_ref().map(|a| (&a.id, a.revision, &a.surfels))
+    }
+
+    /// Memory of the closed submaps that stay in the model.
+    pub fn closed_bytes(&self) -> usize {
+        self.closed.iter().map(Recent::bytes).sum()
     }
 
     /// Takes a frame: tracks it, and maps it if allowed.
@@ -426,15 +439,25 @@ impl Agent {
         (id, Event::SubmapOpened(opened, frame.clone()))
     }
 
+    /// Lets the oldest closed submaps go that are beyond the number or the bytes that may stay. The last one stays.
+    fn evict(&mut self) {
+        let settings = &self.settings.tracking;
+        let budget_bytes = settings.resident_budget_mb * 1e6;
+        let mut bytes = self.closed_bytes();
+        while self.closed.len() > settings.closed_submaps.max(1)
+            || (self.closed.len() > 1 && bytes as f64 > budget_bytes)
+        {
+            let Some(oldest) = self.closed.pop_front() else { return };
+            bytes -= oldest.bytes();
+        }
+    }
+
     /// Finishes the submap under work. But for what the next one has `taken` over, it stays to be tracked against.
     fn close_active(&mut self, taken: &[bool]) -> Option<Event> {
         let active = self.active.take()?;
         let (id, chain, agent_from_submap) = (active.id.clone(), active.chain, active.agent_from_submap);
         let (rest, intensity) = active.rest(taken, &self.settings.mapping);
         let surfels = Arc::new(active.close(&self.settings.mapping));
-        while self.closed.len() >= self.settings.tracking.closed_submaps.max(1) {
-            self.closed.pop_front();
-        }
         self.closed.push_back(Recent {
             id: id.clone(),
             chain,
@@ -442,6 +465,7 @@ impl Agent {
             intensity: Some(intensity),
             agent_from_submap,
         });
+        self.evict();
         Some(Event::SubmapClosed(id, surfels))
     }
 }

@@ -35,6 +35,9 @@ pub struct SurfelCloud {
 }
 
 impl SurfelCloud {
+    /// Bytes that one surfel takes.
+    pub const SURFEL_BYTES: usize = 13 * size_of::<f32>();
+
     /// Number of surfels.
     pub fn len(&self) -> usize {
         self.center_m.len()

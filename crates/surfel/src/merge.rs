@@ -7,7 +7,9 @@
 
 use crate::{Surfel, SurfelCloud};
 use coma_geometry::Pose;
+use std::borrow::Cow;
 use std::collections::HashMap;
+use std::convert::Infallible;
 
 /// A submap and where it lies.
 #[derive(Clone, Copy, Debug)]
@@ -42,7 +44,7 @@ type Cell = ([i32; 3], u8);
 /// What one submap has in a cube.
 #[derive(Clone, Copy)]
 struct Share {
-    part: usize,
+    part: u32,
     /// Of its discs, times opacity, each at most the cube's face.
     shown_m2: f32,
     /// Of its discs.
@@ -50,46 +52,63 @@ struct Share {
     count: u32,
 }
 
+impl Share {
+    fn add(&mut self, other: &Share) {
+        self.shown_m2 += other.shown_m2;
+        self.discs_m2 += other.discs_m2;
+        self.count += other.count;
+    }
+}
+
 /// One cloud in the map, submap by submap in the order given. Surfels that are not finite are left out.
 pub fn merge(parts: &[Part<'_>], settings: &MergeSettings) -> SurfelCloud {
-    merge_counted(parts, settings).0
+    let part = |i: usize| Ok::<_, Infallible>((Cow::Borrowed(parts[i].surfels), parts[i].map_from_submap));
+    match merge_each(parts.len(), part, settings) {
+        Ok((map, _)) => map,
+        Err(never) => match never {},
+    }
 }
 
-/// As [`merge`], and how many surfels of each submap are kept.
-pub fn merge_counted(parts: &[Part<'_>], settings: &MergeSettings) -> (SurfelCloud, Vec<usize>) {
+/// As [`merge`], of `count` submaps that need not be in memory together: `part` is asked twice for each, in order, for
+/// its surfels and `map_from_submap`. Beside the map: how many surfels of each submap are kept.
+pub fn merge_each<'a, E>(
+    count: usize,
+    mut part: impl FnMut(usize) -> Result<(Cow<'a, SurfelCloud>, Pose), E>,
+    settings: &MergeSettings,
+) -> Result<(SurfelCloud, Vec<usize>), E> {
     let face_m2 = (settings.cell_m * settings.cell_m) as f32;
     let mut shares: HashMap<Cell, Vec<Share>> = HashMap::new();
-    for (part, surfel) in placed(parts) {
-        let of_cell = shares.entry(cell(&surfel, settings.cell_m)).or_default();
-        if of_cell.last().is_none_or(|s| s.part != part) {
-            of_cell.push(Share { part, shown_m2: 0.0, discs_m2: 0.0, count: 0 });
-        }
-        let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1];
-        if let Some(share) = of_cell.last_mut() {
-            share.shown_m2 += (disc_m2 * surfel.opacity).min(face_m2);
-            share.discs_m2 += disc_m2;
-            share.count += 1;
-        }
-    }
-    let mut keepers: HashMap<Cell, Option<usize>> = HashMap::new();
-    let (mut out, mut kept) = (SurfelCloud::default(), vec![0; parts.len()]);
-    for (part, surfel) in placed(parts) {
-        let cell = cell(&surfel, settings.cell_m);
-        let keeper = *keepers.entry(cell).or_insert_with(|| keeper(&shares, cell, face_m2, settings));
-        if keeper.is_none_or(|keeper| keeper == part) {
-            out.push(surfel);
-            kept[part] += 1;
+    for i in 0..count {
+        let (surfels, map_from_submap) = part(i)?;
+        for surfel in placed(&surfels, &map_from_submap) {
+            let of_cell = shares.entry(cell(&surfel, settings.cell_m)).or_default();
+            let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1];
+            let shown_m2 = (disc_m2 * surfel.opacity).min(face_m2);
+            match of_cell.last_mut().filter(|share| share.part == i as u32) {
+                Some(share) => share.add(&Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 }),
+                None => of_cell.push(Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 }),
+            }
         }
     }
-    (out, kept)
+    let mut keepers: HashMap<Cell, Option<u32>> = HashMap::new();
+    let (mut out, mut kept) = (SurfelCloud::default(), vec![0; count]);
+    for i in 0..count {
+        let (surfels, map_from_submap) = part(i)?;
+        for surfel in placed(&surfels, &map_from_submap) {
+            let cell = cell(&surfel, settings.cell_m);
+            let keeper = *keepers.entry(cell).or_insert_with(|| keeper(&shares, cell, face_m2, settings));
+            if keeper.is_none_or(|keeper| keeper == i as u32) {
+                out.push(surfel);
+                kept[i] += 1;
+            }
+        }
+    }
+    Ok((out, kept))
 }
 
-fn placed<'a>(parts: &'a [Part<'_>]) -> impl Iterator<Item = (usize, Surfel)> + 'a {
-    let finite = |part: &'a Part<'_>| part.surfels.iter().filter(Surfel::is_finite);
-    parts
-        .iter()
-        .enumerate()
-        .flat_map(move |(i, part)| finite(part).map(move |s| (i, s.moved(&part.map_from_submap))))
+/// Surfels in the map.
+fn placed<'a>(surfels: &'a SurfelCloud, map_from_submap: &'a Pose) -> impl Iterator<Item = Surfel> + 'a {
+    surfels.iter().filter(Surfel::is_finite).map(|surfel| surfel.moved(map_from_submap))
 }
 
 /// Which submap keeps its surfels in a cube; `None` if none shows it.
@@ -98,7 +117,7 @@ fn keeper(
     cell: Cell,
     face_m2: f32,
     settings: &MergeSettings,
-) -> Option<usize> {
+) -> Option<u32> {
     let (cube, side) = cell;
     let axis = side as usize / 2;
     let mut sums: Vec<Share> = Vec::new();
@@ -107,11 +126,7 @@ fn keeper(
         near[axis] = near[axis].saturating_add(step);
         for share in shares.get(&(near, side)).into_iter().flatten() {
             match sums.iter_mut().find(|s| s.part == share.part) {
-                Some(sum) => {
-                    sum.shown_m2 += share.shown_m2;
-                    sum.discs_m2 += share.discs_m2;
-                    sum.count += share.count;
-                }
+                Some(sum) => sum.add(share),
                 None => sums.push(*share),
             }
         }
@@ -154,13 +169,16 @@ mod tests {
     #[test]
     fn what_a_submap_before_shows_as_well_is_dropped_and_what_is_new_is_kept() {
         let wall = wall(false);
-        let (merged, kept) =
-            merge_counted(&[at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)], &MergeSettings::default());
+        let parts = [(0.0, 0.005), (0.5, 0.01)].map(|(x, z)| Pose::translation(x, 0.0, z));
+        let part = |i: usize| Ok::<_, Infallible>((Cow::Borrowed(&wall), parts[i]));
+        let (merged, kept) = merge_each(2, part, &MergeSettings::default()).unwrap();
         assert_eq!(kept, [wall.len(), merged.len() - wall.len()]);
         // The second wall adds its right half.
         assert!((14_800..=15_200).contains(&merged.len()), "{}", merged.len());
         let alone = merge(&[at(&wall, 0.0, 0.005)], &MergeSettings::default());
         assert_eq!(alone.len(), wall.len(), "a submap never drops its own");
+        let together = merge(&[at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)], &MergeSettings::default());
+        assert_eq!(together, merged);
     }
 
     #[test]

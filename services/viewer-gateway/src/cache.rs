@@ -6,9 +6,6 @@ use coma_surfel::SurfelCloud;
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
-/// Bytes of one surfel once it is unpacked.
-const UNPACKED_BYTES: usize = 13 * size_of::<f32>();
-
 /// One submap's surfels, packed as the agent sent them, and unpacked when first asked for.
 #[derive(Debug)]
 pub struct CachedSurfels {
@@ -36,7 +33,7 @@ impl CachedSurfels {
 
     /// Bytes that it may come to take.
     fn weight(&self) -> usize {
-        self.packed.len() + self.packed.len() / coma_surfel::pack::SURFEL_BYTES * UNPACKED_BYTES
+        self.packed.len() + self.packed.len() / coma_surfel::pack::SURFEL_BYTES * SurfelCloud::SURFEL_BYTES
     }
 }
 

@@ -216,7 +216,7 @@ pub fn frame_to_model(
     let refined =
         refine(model, frame, guess_agent_from_camera, brightness, &settings.adam).ok_or_else(not_aligned)?;
     let pose = refined.agent_from_camera;
-    let view = &view.coarser(settings.finest_level);
+    let view = &settings.aligned(view);
     let picture = model.picture(&pose, &frame.camera, view, settings);
     let still = AlignSettings { steps: vec![0], ..settings.frame_to_model.clone() };
     let found = align(&picture.view, view, &Pose::identity(), brightness, &still).ok_or_else(not_aligned)?;

@@ -31,6 +31,9 @@ pub struct TrackingSettings {
     /// Pictures are aligned at this resolution: 0 is the frame's own, 1 half of it, and coarser ones before. Half is as
     /// exact as the whole, as depth and colour of four pixels are averaged, at a quarter of the cost.
     pub finest_level: usize,
+    /// Small pictures are aligned at a finer resolution than `finest_level`, down to their own, if fewer pixels than this
+    /// would be left: what lies near edges is not aligned, and in a picture of few pixels that is most of it.
+    pub least_pixels: usize,
     /// Frame against the frame before.
     pub frame_to_frame: AlignSettings,
     /// How a frame is brought from its guess to the map: `gauss-newton` or `adam`.
@@ -44,6 +47,9 @@ pub struct TrackingSettings {
     /// Closed submaps that stay in the model beside the one under work: the last ones of the chain, at least 1. A camera
     /// that comes back to what they show is tracked against it, where new surfels would hold the drift of a round.
     pub closed_submaps: usize,
+    /// Memory for closed submaps that stay in the model, megabytes (1e6 bytes). Beyond it the oldest go, whatever
+    /// `closed_submaps` allows, but never the last one. What went is in the agent's store, packed.
+    pub resident_budget_mb: f64,
     /// The model is trusted where it is more opaque than this (eq. 4).
     pub model_opacity: f32,
     /// Below this share of fitting pixels the frame is mapped at once.
@@ -76,6 +82,13 @@ impl TrackingSettings {
     pub fn levels(&self) -> usize {
         self.finest_level + self.frame_to_frame.steps.len().max(self.frame_to_model.steps.len())
     }
+
+    /// The resolutions of `view` that are aligned.
+    pub(crate) fn aligned(&self, view: &TrackingView) -> TrackingView {
+        let enough =
+            |level: &usize| view.levels.get(*level).is_some_and(|l| l.camera.pixels() >= self.least_pixels);
+        view.coarser((1..=self.finest_level).rev().find(enough).unwrap_or(0))
+    }
 }
 
 impl Tracked {
@@ -89,6 +102,7 @@ impl Default for TrackingSettings {
     fn default() -> Self {
         TrackingSettings {
             finest_level: 1,
+            least_pixels: 4_000,
             frame_to_frame: AlignSettings::default(),
             method: Method::default(),
             adam: AdamSettings::default(),
@@ -102,6 +116,7 @@ impl Default for TrackingSettings {
             },
             model_rounds: 1,
             closed_submaps: 8,
+            resident_budget_mb: 256.0,
             model_opacity: 0.9,
             map_at_once_share: 0.4,
             degraded_share: 0.25,
@@ -209,7 +224,7 @@ pub fn frame_to_frame(
     last_motion: &Pose,
     settings: &TrackingSettings,
 ) -> Option<Alignment> {
-    let (previous, view) = (&previous.coarser(settings.finest_level), &view.coarser(settings.finest_level));
+    let (previous, view) = (&settings.aligned(previous), &settings.aligned(view));
     let with_velocity = align(previous, view, last_motion, Brightness::default(), &settings.frame_to_frame);
     match with_velocity {
         Some(found) if found.inlier_share() > settings.map_at_once_share => Some(found),
@@ -247,7 +262,7 @@ pub fn frame_to_model(
     settings: &TrackingSettings,
 ) -> Result<Tracked, Vec<Reason>> {
     let full = view.levels[0].camera;
-    let view = &view.coarser(settings.finest_level);
+    let view = &settings.aligned(view);
     let mut pose = *guess_agent_from_camera;
     let mut brightness = brightness;
     let mut hits = 0;
