@@ -133,7 +133,7 @@ impl GaussianAgent {
         }
         let intensity = picture.color.map(|c| luminance(*c));
         let model = TrackingView::build(frame.camera, depth_m, intensity, view.noise, view.levels.len());
-        let (model, view) = (settings.aligned(&model), settings.aligned(&view));
+        let (model, view) = (settings.aligned(&model), settings.aligned(view));
         let found = align(&model, &view, &Pose::identity(), self.brightness, &settings.frame_to_model)?;
         let mut pose = guess * found.reference_from_camera;
         pose.rotation.renormalize();
