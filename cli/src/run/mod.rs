@@ -169,7 +169,7 @@ impl Run {
         .await
     }
 
-    /// Writes what the agents know, all of which is let go again.
+    /// Fetches what the agents know and writes it; none of it stays in memory.
     async fn write(
         &mut self,
         calls: &mut [AgentCalls],

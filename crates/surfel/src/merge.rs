@@ -77,26 +77,26 @@ pub fn merge_each<'a, E>(
     settings: &MergeSettings,
 ) -> Result<(SurfelCloud, Vec<usize>), E> {
     let face_m2 = (settings.cell_m * settings.cell_m) as f32;
-    let mut shares: HashMap<Cell, Vec<Share>> = HashMap::new();
+    let mut shares = Vec::new();
     for i in 0..count {
         let (surfels, map_from_submap) = part(i)?;
+        let mut of_part: HashMap<Cell, Share> = HashMap::new();
         for surfel in placed(&surfels, &map_from_submap) {
-            let of_cell = shares.entry(cell(&surfel, settings.cell_m)).or_default();
             let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1];
             let shown_m2 = (disc_m2 * surfel.opacity).min(face_m2);
-            match of_cell.last_mut().filter(|share| share.part == i as u32) {
-                Some(share) => share.add(&Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 }),
-                None => of_cell.push(Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 }),
-            }
+            let share = Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 };
+            of_part.entry(cell(&surfel, settings.cell_m)).and_modify(|sum| sum.add(&share)).or_insert(share);
         }
+        shares.extend(of_part);
     }
-    let mut keepers: HashMap<Cell, Option<u32>> = HashMap::new();
+    let keepers = keepers(shares, face_m2, settings);
     let (mut out, mut kept) = (SurfelCloud::default(), vec![0; count]);
     for i in 0..count {
         let (surfels, map_from_submap) = part(i)?;
         for surfel in placed(&surfels, &map_from_submap) {
             let cell = cell(&surfel, settings.cell_m);
-            let keeper = *keepers.entry(cell).or_insert_with(|| keeper(&shares, cell, face_m2, settings));
+            let keeper =
+                keepers.binary_search_by_key(&cell, |(cell, _)| *cell).ok().and_then(|at| keepers[at].1);
             if keeper.is_none_or(|keeper| keeper == i as u32) {
                 out.push(surfel);
                 kept[i] += 1;
@@ -111,20 +111,27 @@ fn placed<'a>(surfels: &'a SurfelCloud, map_from_submap: &'a Pose) -> impl Itera
     surfels.iter().filter(Surfel::is_finite).map(|surfel| surfel.moved(map_from_submap))
 }
 
-/// Which submap keeps its surfels in a cube; `None` if none shows it.
-fn keeper(
-    shares: &HashMap<Cell, Vec<Share>>,
-    cell: Cell,
+/// Which submap keeps its surfels in each cube, sorted by cube; `None` if none shows it.
+fn keepers(
+    mut shares: Vec<(Cell, Share)>,
     face_m2: f32,
     settings: &MergeSettings,
-) -> Option<u32> {
+) -> Vec<(Cell, Option<u32>)> {
+    shares.sort_unstable_by_key(|(cell, share)| (*cell, share.part));
+    let cells = shares.chunk_by(|a, b| a.0 == b.0);
+    cells.map(|of_cell| (of_cell[0].0, keeper(&shares, of_cell[0].0, face_m2, settings))).collect()
+}
+
+/// Which submap keeps its surfels in a cube; `None` if none shows it. `shares` are sorted by cube, then submap.
+fn keeper(shares: &[(Cell, Share)], cell: Cell, face_m2: f32, settings: &MergeSettings) -> Option<u32> {
     let (cube, side) = cell;
     let axis = side as usize / 2;
     let mut sums: Vec<Share> = Vec::new();
     for step in [0, -1, 1] {
         let mut near = cube;
         near[axis] = near[axis].saturating_add(step);
-        for share in shares.get(&(near, side)).into_iter().flatten() {
+        let first = shares.partition_point(|(cell, _)| *cell < (near, side));
+        for (_, share) in shares[first..].iter().take_while(|(cell, _)| *cell == (near, side)) {
             match sums.iter_mut().find(|s| s.part == share.part) {
                 Some(sum) => sum.add(share),
                 None => sums.push(*share),
