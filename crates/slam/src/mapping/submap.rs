@@ -26,6 +26,10 @@ pub struct MappingSettings {
     pub inherit: InheritSettings,
     /// How surfels are optimised.
     pub optimise: OptimiseSettings,
+    /// Share of its distance from 1 that a frame's gain loses before the frame colours the map. Errors of a gain are small
+    /// but of one sign, and the next frames inherit them: without this, a map grows darker or brighter for as long as its
+    /// agent lives. A camera whose exposure has changed for good colours the map its own way after some hundred frames.
+    pub gain_relaxation: f64,
     /// A mapping keyframe every so many mapped frames (paper: N_opt = 5).
     pub keyframe_every: u32,
     /// Optimiser steps in a frame's work budget, spent at keyframes.
@@ -60,6 +64,7 @@ impl Default for MappingSettings {
             fuse: FuseSettings::default(),
             inherit: InheritSettings::default(),
             optimise: OptimiseSettings::default(),
+            gain_relaxation: 0.005,
             keyframe_every: 5,
             steps_per_keyframe: 6,
             moving_frames: 20,
@@ -158,6 +163,7 @@ impl ActiveSubmap {
         render_settings: &RenderSettings,
     ) -> MappedFrame {
         let mut out = MappedFrame::default();
+        let brightness = brightness.relaxed(settings.gain_relaxation);
         let color = corrected_color(&frame.color, brightness);
         let camera_from_submap = submap_from_camera.inverse();
         let at_rest = self.still_frames >= settings.rest_after_frames.max(1);

@@ -68,6 +68,13 @@ pub struct Brightness {
     pub gain: f64,
 }
 
+impl Brightness {
+    /// Nearer to 1 by this share of the distance.
+    pub fn relaxed(self, share: f64) -> Brightness {
+        Brightness { gain: self.gain + share * (1.0 - self.gain) }
+    }
+}
+
 impl Default for Brightness {
     fn default() -> Self {
         Brightness { gain: 1.0 }
