@@ -149,3 +149,13 @@ fn the_gradient_agrees_with_differences_of_the_frozen_association() {
         assert!(error < 0.05, "axis {axis}: {error}");
     }
 }
+
+#[test]
+fn a_gain_s_bias_adds_up_to_little() {
+    // Every frame takes over the gain before and errs by one in ten thousand.
+    let after =
+        |share: f64| (0..10_000).fold(1.0, |gain, _| Brightness { gain: gain * 0.9999 }.relaxed(share).gain);
+    assert!(after(0.0) < 0.4, "{}", after(0.0));
+    assert!(after(0.005) > 0.97, "{}", after(0.005));
+    assert_eq!(Brightness { gain: 2.0 }.relaxed(0.25).gain, 1.75);
+}
