@@ -110,6 +110,7 @@ export function hint(state) {
     $("hint").hidden = false;
   };
   const reachable = state.agents.filter((agent) => agent.reachable);
+  if (!state.knowsSubmaps) return;
   if (state.submaps.size) $("hint").hidden = true;
   else if (!state.agents.length) {
     show("No agents are known", "Name them when the gateway starts:", "$ coma gateway --agent http://robot-1:7001", "Or see the whole cluster on a built-in world:", "$ coma demo");

@@ -7,6 +7,8 @@ export class State {
   agents = [];
   /** By submap id. */
   submaps = new Map();
+  /** False until the submaps were asked for once: until then it isn't known whether there are any. */
+  knowsSubmaps = false;
   /** By agent: poses by sequence. */
   poses = new Map();
   graph = { loops: [], components: [], not_joined: [], submaps: [], odometry: [] };
@@ -26,6 +28,7 @@ export class State {
 
   setSubmaps(submaps) {
     this.submaps = new Map(submaps.map((submap) => [submap.id, submap]));
+    this.knowsSubmaps = true;
   }
 
   /** Submaps that were asked for alone: others stay as they are. */
