@@ -97,6 +97,11 @@ impl Submap {
         self.packed.len() as u64
     }
 
+    /// Number of surfels.
+    pub fn count(&self) -> anyhow::Result<usize> {
+        coma_surfel::pack::count(&self.packed, MAX_SURFELS).with_context(|| format!("submap {}", self.id))
+    }
+
     /// In its own frame.
     pub fn surfels(&self) -> anyhow::Result<SurfelCloud> {
         coma_surfel::pack::unpack(&self.packed, MAX_SURFELS).with_context(|| format!("submap {}", self.id))

@@ -95,29 +95,49 @@ pub fn pack(surfels: &SurfelCloud) -> Vec<u8> {
 /// Unpacks at most `max_surfels`. Any bytes are answered, none make it panic, and nothing is allocated
 /// before the count and the length agree.
 pub fn unpack(bytes: &[u8], max_surfels: usize) -> Result<SurfelCloud, UnpackError> {
-    let header = bytes.first_chunk::<HEADER_BYTES>().ok_or(UnpackError::Header)?;
-    let word = |i: usize| [header[4 * i], header[4 * i + 1], header[4 * i + 2], header[4 * i + 3]];
-    if word(0) != *MAGIC || word(2) != [0; 4] || word(9) != [0; 4] {
-        return Err(UnpackError::Header);
-    }
-    let count = u32::from_le_bytes(word(1)) as usize;
-    if count > max_surfels {
-        return Err(UnpackError::TooMany { count, max: max_surfels });
-    }
-    let needed = count.saturating_mul(SURFEL_BYTES).saturating_add(HEADER_BYTES);
-    if bytes.len() != needed {
-        return Err(UnpackError::Length { found: bytes.len(), count, needed });
-    }
-    let box_min: [f32; 3] = std::array::from_fn(|axis| f32::from_le_bytes(word(3 + axis)));
-    let box_max: [f32; 3] = std::array::from_fn(|axis| f32::from_le_bytes(word(6 + axis)));
-    for axis in 0..3 {
-        let (min, max) = (box_min[axis], box_max[axis]);
-        if !(min.is_finite() && max.is_finite() && min <= max) {
-            return Err(UnpackError::Box { axis, min: min.to_string(), max: max.to_string() });
-        }
-    }
-    let packed = bytes[HEADER_BYTES..].chunks_exact(SURFEL_BYTES);
+    let Header { box_min, box_max, packed, .. } = Header::read(bytes, max_surfels)?;
+    let packed = packed.chunks_exact(SURFEL_BYTES);
     Ok(packed.map(|bytes| unpack_one(bytes, &box_min, &box_max)).collect())
+}
+
+/// How many surfels [`unpack`] would give, without unpacking them.
+pub fn count(bytes: &[u8], max_surfels: usize) -> Result<usize, UnpackError> {
+    Ok(Header::read(bytes, max_surfels)?.count)
+}
+
+struct Header<'a> {
+    count: usize,
+    box_min: [f32; 3],
+    box_max: [f32; 3],
+    /// What follows: `count` surfels.
+    packed: &'a [u8],
+}
+
+impl<'a> Header<'a> {
+    fn read(bytes: &'a [u8], max_surfels: usize) -> Result<Self, UnpackError> {
+        let header = bytes.first_chunk::<HEADER_BYTES>().ok_or(UnpackError::Header)?;
+        let word = |i: usize| [header[4 * i], header[4 * i + 1], header[4 * i + 2], header[4 * i + 3]];
+        if word(0) != *MAGIC || word(2) != [0; 4] || word(9) != [0; 4] {
+            return Err(UnpackError::Header);
+        }
+        let count = u32::from_le_bytes(word(1)) as usize;
+        if count > max_surfels {
+            return Err(UnpackError::TooMany { count, max: max_surfels });
+        }
+        let needed = count.saturating_mul(SURFEL_BYTES).saturating_add(HEADER_BYTES);
+        if bytes.len() != needed {
+            return Err(UnpackError::Length { found: bytes.len(), count, needed });
+        }
+        let box_min: [f32; 3] = std::array::from_fn(|axis| f32::from_le_bytes(word(3 + axis)));
+        let box_max: [f32; 3] = std::array::from_fn(|axis| f32::from_le_bytes(word(6 + axis)));
+        for axis in 0..3 {
+            let (min, max) = (box_min[axis], box_max[axis]);
+            if !(min.is_finite() && max.is_finite() && min <= max) {
+                return Err(UnpackError::Box { axis, min: min.to_string(), max: max.to_string() });
+            }
+        }
+        Ok(Header { count, box_min, box_max, packed: &bytes[HEADER_BYTES..] })
+    }
 }
 
 /// The box of all finite centres.
@@ -252,6 +272,7 @@ mod tests {
         let before = cloud(5000);
         let bytes = pack(&before);
         assert!(bytes.len() <= 24 * before.len());
+        assert_eq!(count(&bytes, before.len()), Ok(before.len()));
         let after = unpack(&bytes, before.len()).unwrap();
         assert_eq!(after.len(), before.len());
         for (a, b) in before.iter().zip(after.iter()) {
@@ -305,6 +326,7 @@ mod tests {
         let bytes = pack(&cloud(4));
         let refused = |bytes: &[u8]| unpack(bytes, 4).unwrap_err().to_string();
         assert_eq!(unpack(&bytes, 3), Err(UnpackError::TooMany { count: 4, max: 3 }));
+        assert_eq!(count(&bytes, 3), Err(UnpackError::TooMany { count: 4, max: 3 }));
         for end in 0..bytes.len() {
             assert!(unpack(&bytes[..end], 4).is_err(), "{end}");
         }
