@@ -1,17 +1,23 @@
 //! What agents have at the end of a run, fetched over gRPC as any client could.
 
 use crate::stream::plain;
-use anyhow::{Context, bail};
+use anyhow::{Context, bail, ensure};
 use coma_geometry::{Pose, SubmapId};
 use coma_runtime::{ByteLedger, Channel, Class, ClientSettings, channel};
-use coma_surfel::SurfelCloud;
+use coma_surfel::{SurfelCloud, pack};
 use coma_wire::v1::agent_client::AgentClient;
 use coma_wire::v1::viewer_client::ViewerClient;
 use coma_wire::{At, Limited, v1};
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom, Write as _};
+use std::ops::Range;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Surfels that one submap may have.
 const MAX_SURFELS: usize = 20_000_000;
+/// Bytes of so many.
+const MAX_PACKED_BYTES: usize = pack::HEADER_BYTES + MAX_SURFELS * pack::SURFEL_BYTES;
 /// How long a drain may go on without any progress.
 const STUCK: Duration = Duration::from_secs(300);
 
@@ -57,6 +63,7 @@ impl AgentCalls {
     /// Every submap with its surfels.
     pub async fn submaps(&mut self) -> anyhow::Result<Vec<Submap>> {
         let list = self.viewer.list_submaps(v1::ListSubmapsRequest {}).await.map_err(plain)?.into_inner();
+        let spool = Arc::new(Spool::new()?);
         let mut out = Vec::new();
         for (i, info) in list.submaps.into_iter().enumerate() {
             let at = At::Root("submaps");
@@ -69,9 +76,15 @@ impl AgentCalls {
             let mut stream = self.viewer.get_submap(request).await.map_err(plain)?.into_inner();
             let mut packed = Vec::new();
             while let Some(message) = stream.message().await.map_err(plain)? {
+                ensure!(
+                    packed.len() + message.chunk.len() <= MAX_PACKED_BYTES,
+                    "submap {id}: more than {MAX_PACKED_BYTES} bytes"
+                );
                 packed.extend_from_slice(&message.chunk);
             }
-            out.push(Submap { id, map_from_submap, packed });
+            let count = pack::count(&packed, MAX_SURFELS).with_context(|| format!("submap {id}"))?;
+            let bytes = spool.put(&packed)?;
+            out.push(Submap { id, map_from_submap, count, bytes, spool: spool.clone() });
         }
         Ok(out)
     }
@@ -87,24 +100,48 @@ pub struct Submap {
     pub id: SubmapId,
     /// Where it lies.
     pub map_from_submap: Pose,
-    /// As [`coma_surfel::pack`] has them: a long run's surfels are many.
-    packed: Vec<u8>,
+    /// Number of surfels.
+    pub count: usize,
+    bytes: Range<u64>,
+    spool: Arc<Spool>,
 }
 
 impl Submap {
     /// Packed size.
     pub fn packed_bytes(&self) -> u64 {
-        self.packed.len() as u64
-    }
-
-    /// Number of surfels.
-    pub fn count(&self) -> anyhow::Result<usize> {
-        coma_surfel::pack::count(&self.packed, MAX_SURFELS).with_context(|| format!("submap {}", self.id))
+        self.bytes.end - self.bytes.start
     }
 
     /// In its own frame.
     pub fn surfels(&self) -> anyhow::Result<SurfelCloud> {
-        coma_surfel::pack::unpack(&self.packed, MAX_SURFELS).with_context(|| format!("submap {}", self.id))
+        let packed = self.spool.get(&self.bytes)?;
+        pack::unpack(&packed, MAX_SURFELS).with_context(|| format!("submap {}", self.id))
+    }
+}
+
+/// Packed surfels, one submap after the other, in a file that goes when the last of them does: a long run has more than
+/// memory should hold.
+struct Spool(Mutex<File>);
+
+impl Spool {
+    fn new() -> anyhow::Result<Self> {
+        Ok(Spool(Mutex::new(tempfile::tempfile().context("a temporary file for submaps")?)))
+    }
+
+    /// Where it lies from now on.
+    fn put(&self, packed: &[u8]) -> anyhow::Result<Range<u64>> {
+        let mut file = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let start = file.seek(SeekFrom::End(0))?;
+        file.write_all(packed).context("writing a submap to a temporary file")?;
+        Ok(start..start + packed.len() as u64)
+    }
+
+    fn get(&self, bytes: &Range<u64>) -> anyhow::Result<Vec<u8>> {
+        let mut file = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        file.seek(SeekFrom::Start(bytes.start))?;
+        let mut packed = vec![0; (bytes.end - bytes.start) as usize];
+        file.read_exact(&mut packed).context("reading a submap from a temporary file")?;
+        Ok(packed)
     }
 }
 

@@ -281,7 +281,7 @@ fn agent(
                 id: s.id.clone(),
                 anchor_frame: anchors.get(&s.id).copied(),
                 component: component_of.get(&s.id).copied(),
-                surfels: s.count()?,
+                surfels: s.count,
                 packed_bytes: s.packed_bytes(),
                 merged_surfels: None,
             })

@@ -38,6 +38,9 @@ impl Default for MergeSettings {
     }
 }
 
+/// What so many submaps show is in memory at a time: with more of them space is looked at in parts, one after the other.
+const PARTS_AT_ONCE: usize = 64;
+
 /// A cube, and which of the six directions a normal faces most.
 type Cell = ([i32; 3], u8);
 
@@ -69,27 +72,37 @@ pub fn merge(parts: &[Part<'_>], settings: &MergeSettings) -> SurfelCloud {
     }
 }
 
-/// As [`merge`], of `count` submaps that need not be in memory together: `part` is asked twice for each, in order, for
-/// its surfels and `map_from_submap`. Beside the map: how many surfels of each submap are kept.
+/// As [`merge`], of `count` submaps that need not be in memory together: `part` is asked for each, in order, for
+/// its surfels and `map_from_submap`; twice, and once more for every 64 submaps. Beside the map: how many surfels of each
+/// submap are kept.
 pub fn merge_each<'a, E>(
     count: usize,
     mut part: impl FnMut(usize) -> Result<(Cow<'a, SurfelCloud>, Pose), E>,
     settings: &MergeSettings,
 ) -> Result<(SurfelCloud, Vec<usize>), E> {
     let face_m2 = (settings.cell_m * settings.cell_m) as f32;
-    let mut shares = Vec::new();
-    for i in 0..count {
-        let (surfels, map_from_submap) = part(i)?;
-        let mut of_part: HashMap<Cell, Share> = HashMap::new();
-        for surfel in placed(&surfels, &map_from_submap) {
-            let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1];
-            let shown_m2 = (disc_m2 * surfel.opacity).min(face_m2);
-            let share = Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 };
-            of_part.entry(cell(&surfel, settings.cell_m)).and_modify(|sum| sum.add(&share)).or_insert(share);
+    let rounds = count.div_ceil(PARTS_AT_ONCE).max(1);
+    let mut keepers = Vec::new();
+    for round in 0..rounds {
+        let mut shares = Vec::new();
+        for i in 0..count {
+            let (surfels, map_from_submap) = part(i)?;
+            let mut of_part: HashMap<Cell, Share> = HashMap::new();
+            for surfel in placed(&surfels, &map_from_submap) {
+                let cell = cell(&surfel, settings.cell_m);
+                if column(&cell) % rounds != round {
+                    continue;
+                }
+                let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1];
+                let shown_m2 = (disc_m2 * surfel.opacity).min(face_m2);
+                let share = Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 };
+                of_part.entry(cell).and_modify(|sum| sum.add(&share)).or_insert(share);
+            }
+            shares.extend(of_part);
         }
-        shares.extend(of_part);
+        keepers.extend(keepers_among(shares, face_m2, settings));
     }
-    let keepers = keepers(shares, face_m2, settings);
+    keepers.sort_unstable_by_key(|(cell, _)| *cell);
     let (mut out, mut kept) = (SurfelCloud::default(), vec![0; count]);
     for i in 0..count {
         let (surfels, map_from_submap) = part(i)?;
@@ -111,8 +124,15 @@ fn placed<'a>(surfels: &'a SurfelCloud, map_from_submap: &'a Pose) -> impl Itera
     surfels.iter().filter(Surfel::is_finite).map(|surfel| surfel.moved(map_from_submap))
 }
 
+/// A number that cubes before and behind a surface have in common: what decides on them lies together.
+fn column((cube, side): &Cell) -> usize {
+    let axis = *side as usize / 2;
+    let across = [cube[(axis + 1) % 3], cube[(axis + 2) % 3]].map(|v| v as u32);
+    (across[0].wrapping_mul(73_856_093) ^ across[1].wrapping_mul(19_349_663)) as usize
+}
+
 /// Which submap keeps its surfels in each cube, sorted by cube; `None` if none shows it.
-fn keepers(
+fn keepers_among(
     mut shares: Vec<(Cell, Share)>,
     face_m2: f32,
     settings: &MergeSettings,
@@ -186,6 +206,15 @@ mod tests {
         assert_eq!(alone.len(), wall.len(), "a submap never drops its own");
         let together = merge(&[at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)], &MergeSettings::default());
         assert_eq!(together, merged);
+    }
+
+    #[test]
+    fn many_submaps_merge_as_few_do() {
+        let wall = wall(false);
+        let two = [at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)];
+        let mut many = two.to_vec();
+        many.resize(2 * PARTS_AT_ONCE + 3, two[0]);
+        assert_eq!(merge(&many, &MergeSettings::default()), merge(&two, &MergeSettings::default()));
     }
 
     #[test]

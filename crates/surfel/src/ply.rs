@@ -65,17 +65,18 @@ pub enum PlyError {
 
 /// Writes surfels. Those with a value that is not finite are left out: viewers choke on them.
 pub fn write(surfels: &SurfelCloud) -> Vec<u8> {
-    let finite: Vec<Surfel> = surfels.iter().filter(Surfel::is_finite).collect();
+    let finite = || surfels.iter().filter(Surfel::is_finite);
+    let count = finite().count();
     let mut header = String::from("ply\nformat binary_little_endian 1.0\ncomment CoMA surfels\n");
-    let _ = writeln!(header, "element vertex {}", finite.len());
+    let _ = writeln!(header, "element vertex {count}");
     for name in PROPERTIES {
         let _ = writeln!(header, "property float {name}");
     }
     header.push_str("end_header\n");
     let mut out = header.into_bytes();
-    out.reserve_exact(finite.len() * PROPERTIES.len() * 4);
-    for surfel in &finite {
-        for value in values(surfel) {
+    out.reserve_exact(count * PROPERTIES.len() * 4);
+    for surfel in finite() {
+        for value in values(&surfel) {
             out.extend_from_slice(&value.to_le_bytes());
         }
     }

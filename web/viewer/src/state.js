@@ -31,9 +31,12 @@ export class State {
     this.knowsSubmaps = true;
   }
 
-  /** Submaps that were asked for alone: others stay as they are. */
+  /** Submaps that were asked for alone: others stay as they are. An answer that is older than the list of all has no say. */
   addSubmaps(submaps) {
-    for (const submap of submaps) this.submaps.set(submap.id, submap);
+    for (const submap of submaps) {
+      const closed = this.submaps.get(submap.id)?.closed && !submap.closed;
+      if (!closed) this.submaps.set(submap.id, submap);
+    }
   }
 
   setTrajectories(trajectories) {
