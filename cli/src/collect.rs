@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 /// Surfels that one submap may have.
 const MAX_SURFELS: usize = 20_000_000;
 /// Bytes of so many.
-const MAX_PACKED_BYTES: usize = pack::HEADER_BYTES + MAX_SURFELS * pack::SURFEL_BYTES;
+const MAX_PACKED_BYTES: usize = pack::packed_bytes(MAX_SURFELS);
 /// How long a drain may go on without any progress.
 const STUCK: Duration = Duration::from_secs(300);
 

@@ -81,7 +81,7 @@ pub fn merge_each<'a, E>(
     settings: &MergeSettings,
 ) -> Result<(SurfelCloud, Vec<usize>), E> {
     let face_m2 = (settings.cell_m * settings.cell_m) as f32;
-    let rounds = count.div_ceil(PARTS_AT_ONCE).max(1);
+    let rounds = count.div_ceil(PARTS_AT_ONCE);
     let mut keepers = Vec::new();
     for round in 0..rounds {
         let mut shares = Vec::new();

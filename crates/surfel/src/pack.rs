@@ -74,11 +74,16 @@ pub enum UnpackError {
     },
 }
 
+/// Bytes of so many surfels, header included.
+pub const fn packed_bytes(count: usize) -> usize {
+    count.saturating_mul(SURFEL_BYTES).saturating_add(HEADER_BYTES)
+}
+
 /// Packs surfels in their order. More than `u32::MAX` of them would be cut there.
 pub fn pack(surfels: &SurfelCloud) -> Vec<u8> {
     let count = surfels.len().min(u32::MAX as usize);
     let (box_min, box_max) = bounds(surfels);
-    let mut out = Vec::with_capacity(HEADER_BYTES + count * SURFEL_BYTES);
+    let mut out = Vec::with_capacity(packed_bytes(count));
     out.extend_from_slice(MAGIC);
     out.extend_from_slice(&(count as u32).to_le_bytes());
     out.extend_from_slice(&[0; 4]);
@@ -124,7 +129,7 @@ impl<'a> Header<'a> {
         if count > max_surfels {
             return Err(UnpackError::TooMany { count, max: max_surfels });
         }
-        let needed = count.saturating_mul(SURFEL_BYTES).saturating_add(HEADER_BYTES);
+        let needed = packed_bytes(count);
         if bytes.len() != needed {
             return Err(UnpackError::Length { found: bytes.len(), count, needed });
         }

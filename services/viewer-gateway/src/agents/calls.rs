@@ -111,8 +111,7 @@ impl Link {
 
     /// One submap's surfels, as they were packed.
     pub async fn packed_surfels(&self, id: &SubmapId, max_surfels: usize) -> Result<CachedSurfels, Status> {
-        use coma_surfel::pack::{HEADER_BYTES, SURFEL_BYTES};
-        let limit = max_surfels.saturating_mul(SURFEL_BYTES).saturating_add(HEADER_BYTES);
+        let limit = coma_surfel::pack::packed_bytes(max_surfels);
         let call = async {
             let request = v1::GetSubmapRequest { id: Some(id.to_wire()) };
             let mut stream = self.viewer().get_submap(request).await?.into_inner();
