@@ -2,7 +2,7 @@
 
 use crate::stream::plain;
 use anyhow::{Context, bail, ensure};
-use coma_geometry::{Pose, SubmapId};
+use coma_geometry::{Pose, StampNs, SubmapId};
 use coma_runtime::{ByteLedger, Channel, Class, ClientSettings, channel};
 use coma_surfel::{SurfelCloud, pack};
 use coma_wire::v1::agent_client::AgentClient;
@@ -44,13 +44,22 @@ impl AgentCalls {
         Ok(self.agent.get_status(v1::GetStatusRequest {}).await.map_err(plain)?.into_inner())
     }
 
-    /// Every pose.
-    pub async fn trajectory(&mut self) -> anyhow::Result<Vec<v1::PoseEstimate>> {
+    /// Every frame's pose.
+    pub async fn trajectory(&mut self) -> anyhow::Result<Vec<FramePose>> {
         let request = v1::GetTrajectoryRequest { first_sequence: 0 };
         let mut stream = self.viewer.get_trajectory(request).await.map_err(plain)?.into_inner();
         let mut poses = Vec::new();
         while let Some(message) = stream.message().await.map_err(plain)? {
-            poses.extend(message.poses);
+            for pose in message.poses {
+                let at = At::Root("poses");
+                let at = at.index(poses.len());
+                poses.push(FramePose {
+                    stamp: StampNs(pose.stamp_ns),
+                    degraded: pose.state() == v1::TrackingState::Degraded,
+                    submap: at.field("submap_id").required(pose.submap_id)?,
+                    map_from_camera: at.field("map_from_camera").required(pose.map_from_camera)?,
+                });
+            }
         }
         Ok(poses)
     }
@@ -92,6 +101,18 @@ impl AgentCalls {
     async fn drain(&mut self) -> anyhow::Result<v1::DrainResponse> {
         Ok(self.agent.drain(v1::DrainRequest {}).await.map_err(plain)?.into_inner())
     }
+}
+
+/// What is kept of a frame's estimate: a long run has many.
+pub struct FramePose {
+    /// The frame's own stamp.
+    pub stamp: StampNs,
+    /// Which submap it was tracked in.
+    pub submap: SubmapId,
+    /// As the graph has it.
+    pub map_from_camera: Pose,
+    /// Whether tracking was in doubt.
+    pub degraded: bool,
 }
 
 /// A submap as it is at the end.

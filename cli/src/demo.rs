@@ -51,6 +51,7 @@ pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
     })?;
     println!("watch the map grow: {}", gateway.url);
     run.finish(&arguments.options, &out).await?;
+    run::score(&arguments.options, &out).await?;
     if !arguments.exit {
         println!("the map stays at {} until ctrl-c", gateway.url);
         coma_runtime::shutdown::requested().await;

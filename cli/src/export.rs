@@ -42,7 +42,7 @@ pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
     let stamps: Vec<Vec<StampNs>> = from_agents
         .iter()
         .map(|from| {
-            let mut stamps: Vec<StampNs> = from.poses.iter().map(|p| StampNs(p.stamp_ns)).collect();
+            let mut stamps: Vec<StampNs> = from.poses.iter().map(|p| p.stamp).collect();
             stamps.sort();
             stamps
         })

@@ -45,7 +45,9 @@ pub fn score(read: &Read, out: &Path, options: &Options) -> anyhow::Result<(Pict
         let base = maps.base.as_ref().map(|map| (map, view.map_from_camera, RenderSettings::default()));
         for (kind, map) in [base, refined].into_iter().enumerate() {
             let Some((surfels, map_from_camera, settings)) = map else { continue };
-            let views = [SubmapView::new(surfels, map_from_camera.inverse())];
+            let camera_from_map = map_from_camera.inverse();
+            let seen = coma_raster::seen(surfels, &camera_from_map, &frame.camera, &settings);
+            let views = [SubmapView::new(&seen, camera_from_map)];
             let rendering = coma_raster::render(&views, &frame.camera, &settings, None);
             let recorded = frame.color.to_unit();
             let distance = match &lpips {

@@ -1,7 +1,7 @@
 //! What refinement leaves in a run's folder, below `refined/`: a map beside the run's own, and what it was made from.
 
 use crate::run::facts::{Facts, SubmapFacts};
-use crate::run::write_atomically;
+use crate::run::{write_atomically, write_in_pieces};
 use anyhow::{Context, bail};
 use coma_geometry::Pose;
 use coma_raster::RenderSettings;
@@ -9,6 +9,8 @@ use coma_slam::mapping::refine::RefineSettings;
 use coma_surfel::SurfelCloud;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufReader;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -99,7 +101,7 @@ impl Files {
 
     /// Writes what is left of a job that is done.
     pub fn write(&self, surfels: &SurfelCloud, facts: &RefinedFacts) -> anyhow::Result<()> {
-        write_atomically(&self.map(), &coma_surfel::ply::write(surfels))?;
+        write_in_pieces(&self.map(), |out| Ok(coma_surfel::ply::write(surfels, out)?))?;
         write_atomically(&self.facts(), &serde_json::to_vec_pretty(facts)?)
     }
 
@@ -193,7 +195,9 @@ pub fn owners(
 
 /// Reads a PLY file.
 pub fn read_map(path: &Path) -> anyhow::Result<SurfelCloud> {
-    coma_surfel::ply::read(&read_bounded(path)?, MAX_SURFELS).with_context(|| path.display().to_string())
+    let shown = || path.display().to_string();
+    let file = BufReader::new(File::open(path).with_context(shown)?);
+    coma_surfel::ply::read(file, MAX_SURFELS).with_context(shown)
 }
 
 /// Reads a file that is not absurdly long.

@@ -4,14 +4,26 @@ use super::facts::Facts;
 use super::gather::Results;
 use anyhow::Context;
 use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::{BufWriter, Write};
 use std::path::Path;
 
 /// Writes a file so that it is there whole or not at all.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> anyhow::Result<()> {
-    let shown = path.display();
+    write_in_pieces(path, |out| Ok(out.write_all(bytes)?))
+}
+
+/// As [`write_atomically`], of bytes that are never in memory together.
+pub fn write_in_pieces(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    let shown = || path.display().to_string();
     let part = path.with_extension("part");
-    std::fs::write(&part, bytes).with_context(|| format!("{shown}"))?;
-    std::fs::rename(&part, path).with_context(|| format!("{shown}"))
+    let mut out = BufWriter::new(File::create(&part).with_context(shown)?);
+    write(&mut out).with_context(shown)?;
+    out.flush().with_context(shown)?;
+    std::fs::rename(&part, path).with_context(shown)
 }
 
 /// File of one agent's trajectory in one component, below `trajectories/`: `<agent>.tum` for the component that
@@ -25,7 +37,7 @@ pub fn trajectory_name(facts: &Facts, agent: usize, component: usize) -> String 
 }
 
 /// Writes everything that needs no truth. `stamps` are the texts of each agent's stamps.
-pub fn write(out: &Path, facts: &Facts, results: &Results, stamps: &[Vec<String>]) -> anyhow::Result<()> {
+pub fn write(out: &Path, facts: &Facts, results: &Results<'_>, stamps: &[Vec<String>]) -> anyhow::Result<()> {
     let trajectories = out.join("trajectories");
     std::fs::create_dir_all(&trajectories).with_context(|| trajectories.display().to_string())?;
     for ((agent, component), poses) in &results.trajectories {
@@ -35,7 +47,7 @@ pub fn write(out: &Path, facts: &Facts, results: &Results, stamps: &[Vec<String>
     }
     for (component, map) in facts.components.iter().zip(&results.maps) {
         if !component.map.is_empty() {
-            write_atomically(&out.join(&component.map), &coma_surfel::ply::write(map))?;
+            write_in_pieces(&out.join(&component.map), |file| map.write(file))?;
         }
     }
     write_atomically(&out.join("graph.g2o"), results.g2o.as_bytes())?;

@@ -1,37 +1,63 @@
 //! What the agents know at the end, as facts: poses by component, maps, the graph, every candidate.
 
 use super::facts::{AgentFacts, ComponentFacts, EdgeFacts, End, Facts, LoopFacts, PoseFacts, SubmapFacts};
-use crate::collect::{AgentCalls, Submap};
+use crate::collect::{AgentCalls, FramePose, Submap};
 use coma_evaluation::{SentBytes, TrafficClass};
 use coma_geometry::{Pose, StampNs, SubmapId};
 use coma_slam::log::{EntryKey, LoopOutcome, Payload};
-use coma_surfel::SurfelCloud;
-use coma_surfel::merge::{MergeSettings, merge_each};
+use coma_surfel::{Keepers, MergeSettings, SurfelCloud, ply};
 use coma_wire::{At, Wire, v1};
 use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::io::Write;
 
 /// What one agent gave.
 pub struct FromAgent {
     /// How it fares.
     pub status: v1::GetStatusResponse,
     /// Every pose.
-    pub poses: Vec<v1::PoseEstimate>,
+    pub poses: Vec<FramePose>,
     /// Every submap.
     pub submaps: Vec<Submap>,
 }
 
 /// A run's results that are not facts but files.
 #[derive(Default)]
-pub struct Results {
+pub struct Results<'a> {
     /// By agent, then component: frame and `map_from_camera`.
     pub trajectories: BTreeMap<(usize, usize), Vec<(usize, Pose)>>,
     /// By component.
-    pub maps: Vec<SurfelCloud>,
+    pub maps: Vec<Map<'a>>,
     /// Every candidate.
     pub loops: Vec<LoopFacts>,
     /// The graph of the largest component, for other programs.
     pub g2o: String,
+}
+
+/// A component's map, to be written submap by submap.
+pub struct Map<'a> {
+    submaps: Vec<&'a Submap>,
+    keepers: Keepers,
+}
+
+impl<'a> Map<'a> {
+    fn of(submaps: Vec<&'a Submap>) -> anyhow::Result<Self> {
+        let part = |i: usize| anyhow::Ok((Cow::Owned(submaps[i].surfels()?), submaps[i].map_from_submap));
+        let keepers = Keepers::among(submaps.len(), part, &MergeSettings::default())?;
+        Ok(Map { submaps, keepers })
+    }
+
+    /// Writes it as PLY.
+    pub fn write(&self, out: &mut dyn Write) -> anyhow::Result<()> {
+        let mut writer = ply::Writer::new(out, self.keepers.counts().iter().sum())?;
+        for (i, submap) in self.submaps.iter().enumerate() {
+            let surfels: SurfelCloud = submap.surfels()?;
+            for surfel in self.keepers.kept(i, &surfels, &submap.map_from_submap) {
+                writer.push(&surfel)?;
+            }
+        }
+        Ok(writer.finish()?)
+    }
 }
 
 /// Asks an agent for everything.
@@ -44,34 +70,33 @@ pub async fn ask(calls: &mut AgentCalls) -> anyhow::Result<FromAgent> {
 }
 
 /// Puts it together. `stamps` are those of each agent's frames, in the order of `facts.agents`.
-pub fn gather(
+pub fn gather<'a>(
     facts: &mut Facts,
-    from_agents: &[FromAgent],
+    from_agents: &'a [FromAgent],
     graph: &v1::GetGraphResponse,
     stamps: &[Vec<StampNs>],
-) -> anyhow::Result<Results> {
+) -> anyhow::Result<Results<'a>> {
     let mut results = Results::default();
     let entries = entries(graph)?;
     let mut component_of = components(facts, graph, from_agents)?;
     let anchors = anchors(facts, &entries, stamps);
     for (i, from) in from_agents.iter().enumerate() {
-        poses(facts, &mut results, i, &from.poses, &stamps[i], &mut component_of)?;
+        poses(facts, &mut results, i, &from.poses, &stamps[i], &mut component_of);
         agent(&mut facts.agents[i], from, &component_of, &anchors)?;
     }
     let mut submaps: Vec<&Submap> = from_agents.iter().flat_map(|f| &f.submaps).collect();
     submaps.sort_by(|a, b| a.id.cmp(&b.id));
     for (index, component) in facts.components.iter_mut().enumerate() {
         let mine = submaps.iter().copied().filter(|s| component_of.get(&s.id) == Some(&index));
-        let mine: Vec<&Submap> = mine.collect();
-        let part = |i: usize| anyhow::Ok((Cow::Owned(mine[i].surfels()?), mine[i].map_from_submap));
-        let (map, kept) = merge_each(mine.len(), part, &MergeSettings::default())?;
-        let kept: BTreeMap<&SubmapId, usize> = mine.iter().map(|s| &s.id).zip(kept).collect();
+        let map = Map::of(mine.collect())?;
+        let ids = map.submaps.iter().map(|s| &s.id);
+        let kept: BTreeMap<&SubmapId, usize> = ids.zip(map.keepers.counts().iter().copied()).collect();
         for submap in facts.agents.iter_mut().flat_map(|a| &mut a.submaps) {
             if let Some(kept) = kept.get(&submap.id) {
                 submap.merged_surfels = Some(*kept);
             }
         }
-        component.surfels = map.len();
+        component.surfels = kept.values().sum();
         component.map = if index == 0 { "map.ply".into() } else { format!("map-{index}.ply") };
         results.maps.push(map);
     }
@@ -165,9 +190,7 @@ fn components(
 ) -> anyhow::Result<BTreeMap<SubmapId, usize>> {
     let mut frames: BTreeMap<SubmapId, usize> = BTreeMap::new();
     for pose in from_agents.iter().flat_map(|f| &f.poses) {
-        if let Some(id) = At::Root("submap_id").optional::<SubmapId>(pose.submap_id.clone())? {
-            *frames.entry(id).or_default() += 1;
-        }
+        *frames.entry(pose.submap.clone()).or_default() += 1;
     }
     let mut found = Vec::new();
     for (i, component) in graph.components.iter().enumerate() {
@@ -224,30 +247,24 @@ fn anchors(
 
 fn poses(
     facts: &mut Facts,
-    results: &mut Results,
+    results: &mut Results<'_>,
     agent: usize,
-    poses: &[v1::PoseEstimate],
+    poses: &[FramePose],
     stamps: &[StampNs],
     component_of: &mut BTreeMap<SubmapId, usize>,
-) -> anyhow::Result<()> {
-    for (i, pose) in poses.iter().enumerate() {
-        let at = At::Root("poses");
-        let at = at.index(i);
-        let Ok(frame) = stamps.binary_search(&StampNs(pose.stamp_ns)) else { continue };
-        let submap: SubmapId = at.field("submap_id").required(pose.submap_id.clone())?;
-        let map_from_camera: Pose = at.field("map_from_camera").required(pose.map_from_camera)?;
+) {
+    for pose in poses {
+        let Ok(frame) = stamps.binary_search(&pose.stamp) else { continue };
         // A submap that no solve has placed yet is a component of its agent's own.
         let next = facts.components.len();
-        let component = *component_of.entry(submap.clone()).or_insert(next);
+        let component = *component_of.entry(pose.submap.clone()).or_insert(next);
         if component == next {
-            let name = format!("{} alone", submap);
+            let name = format!("{} alone", pose.submap);
             facts.components.push(ComponentFacts { name, submaps: 1, ..ComponentFacts::default() });
         }
-        let degraded = pose.state() == v1::TrackingState::Degraded;
-        facts.agents[agent].poses.push(PoseFacts { frame, component, degraded });
-        results.trajectories.entry((agent, component)).or_default().push((frame, map_from_camera));
+        facts.agents[agent].poses.push(PoseFacts { frame, component, degraded: pose.degraded });
+        results.trajectories.entry((agent, component)).or_default().push((frame, pose.map_from_camera));
     }
-    Ok(())
 }
 
 fn agent(

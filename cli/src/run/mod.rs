@@ -6,7 +6,7 @@ mod folder;
 mod g2o;
 pub mod gather;
 
-pub use folder::{trajectory_name, write as write_folder, write_atomically};
+pub use folder::{trajectory_name, write as write_folder, write_atomically, write_in_pieces};
 
 use crate::cluster::Cluster;
 use crate::collect::{self, AgentCalls};
@@ -78,7 +78,13 @@ pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
     let mut run = Run::start(arguments.specs, &arguments.options, &arguments.out).await?;
     run.finish(&arguments.options, &arguments.out).await?;
     run.cluster.shutdown().await;
-    Ok(())
+    score(&arguments.options, &arguments.out).await
+}
+
+/// Scores the finished run in `out`.
+pub async fn score(options: &Options, out: &Path) -> anyhow::Result<()> {
+    let lpips_model = options.lpips_model.clone();
+    eval::score(out, &eval::Options { lpips_model, ..eval::Options::default() }).await
 }
 
 /// Agents that are about to be fed.
@@ -131,7 +137,7 @@ impl Run {
         Ok(Run { cluster, sources, faults, facts })
     }
 
-    /// Streams everything, waits until the agents agree, and writes the folder with its scores. The agents go on.
+    /// Streams everything, waits until the agents agree, and writes the folder but for its scores. The agents go on.
     pub async fn finish(&mut self, options: &Options, out: &Path) -> anyhow::Result<()> {
         let (begin, cpu) = (Instant::now(), cpu_seconds());
         self.facts.started = rfc3339(SystemTime::now());
@@ -161,12 +167,7 @@ impl Run {
         self.facts.cpu_s = cpu.zip(cpu_seconds()).map(|(before, after)| after - before);
         self.facts.finished = rfc3339(SystemTime::now());
 
-        self.write(&mut calls, &stamps, &texts, out).await?;
-        eval::score(
-            out,
-            &eval::Options { lpips_model: options.lpips_model.clone(), ..eval::Options::default() },
-        )
-        .await
+        self.write(&mut calls, &stamps, &texts, out).await
     }
 
     /// Fetches what the agents know and writes it; none of it stays in memory.
@@ -177,13 +178,17 @@ impl Run {
         texts: &[Vec<String>],
         out: &Path,
     ) -> anyhow::Result<()> {
+        let spinner = progress::spinner("writing");
+        spinner.set_message("poses and the merged map");
         let mut from_agents = Vec::new();
         for call in &mut *calls {
             from_agents.push(gather::ask(call).await?);
         }
         let graph = calls.first_mut().context("no agents")?.graph().await?;
         let results = gather::gather(&mut self.facts, &from_agents, &graph, stamps)?;
-        folder::write(out, &self.facts, &results, texts)
+        folder::write(out, &self.facts, &results, texts)?;
+        spinner.finish_and_clear();
+        Ok(())
     }
 
     async fn stream_all(&mut self, options: &Options) -> anyhow::Result<Vec<Streamed>> {

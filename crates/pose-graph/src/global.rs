@@ -5,6 +5,7 @@ use crate::consistency::{Bridge, lonely};
 use crate::gnc::{self, RobustSettings, RobustSolved, Trust};
 use crate::graph::{DEFAULT_ANCHOR_PRIORITY, Edge, EdgeKey, GraphEntries, NodeInfo, UsableGraph};
 use crate::relative::{JoinSettings, Joined, NotJoined, join};
+use crate::sets::Sets;
 use crate::solution::{Component, LoopVerdict, LoopWeight, PairJoin, PairReport, Solution, pose_digest};
 use crate::solver::{Constraint, Problem, SolveError, SolverSettings};
 use coma_geometry::{AgentId, MapId, Pose, SubmapId};
@@ -160,23 +161,13 @@ pub(crate) fn relate(
 
 /// Chains that joins connect, directly or through others.
 fn connected_chains(count: usize, joins: &Joins) -> Vec<Vec<usize>> {
-    let mut root: Vec<usize> = (0..count).collect();
-    fn find(root: &mut [usize], mut k: usize) -> usize {
-        while root[k] != k {
-            root[k] = root[root[k]];
-            k = root[k];
-        }
-        k
-    }
-    for ((s, t), outcome) in joins {
-        if outcome.is_ok() {
-            let (a, b) = (find(&mut root, *s), find(&mut root, *t));
-            root[a.max(b)] = a.min(b);
-        }
+    let mut connected = Sets::new(count);
+    for ((s, t), _) in joins.iter().filter(|(_, outcome)| outcome.is_ok()) {
+        connected.join(*s, *t);
     }
     let mut groups: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for k in 0..count {
-        groups.entry(find(&mut root, k)).or_default().push(k);
+        groups.entry(connected.find(k)).or_default().push(k);
     }
     groups.into_values().collect()
 }
@@ -295,7 +286,8 @@ fn solve_component(
     let odometry = members.iter().flat_map(|&k| chains[k].solved_odometry.iter());
     let (submaps, outcome) = Indexed::new(&start, &gauge).solve(odometry, &loops, &trust, settings);
     let weigh = |edge: &Edge, weight: f64, poses: &BTreeMap<SubmapId, Pose>| {
-        weigh(edge, weight, poses, contradicting.contains(&edge.key), settings)
+        let limit = settings.robust.limit(chain_within(chain_of, edge).is_some());
+        weigh(edge, weight, poses, contradicting.contains(&edge.key), limit)
     };
     let mut component = Component {
         map_id: MapId::of(&gauge),
@@ -369,7 +361,7 @@ fn weigh(
     weight: f64,
     poses: &BTreeMap<SubmapId, Pose>,
     contradicts: bool,
-    settings: &GlobalSettings,
+    limit: f64,
 ) -> LoopWeight {
     let squared_error = match (poses.get(&edge.from), poses.get(&edge.to)) {
         (Some(i), Some(j)) => {
@@ -378,7 +370,7 @@ fn weigh(
         }
         _ => f64::NAN,
     };
-    LoopWeight::judged(edge, weight, squared_error, contradicts, settings)
+    LoopWeight::judged(edge, weight, squared_error, contradicts, limit)
 }
 
 /// Loops whose ends ended up in different components.

@@ -40,6 +40,7 @@ mod polish;
 pub mod preview;
 pub mod relative;
 pub mod residual;
+mod sets;
 pub mod solution;
 pub mod solver;
 pub mod sparse;

@@ -5,6 +5,7 @@ use crate::global::GlobalSettings;
 use crate::gnc::final_weight;
 use crate::graph::{Edge, EdgeKind, EntryProblem, GraphEntries, UsableGraph, checked_edge};
 use crate::residual::{residual, squared_mahalanobis};
+use crate::sets::Sets;
 use crate::solution::Component;
 use crate::solver::{Constraint, Problem, SolveError, Solver, SolverSettings};
 use coma_geometry::{Pose, SubmapId, se3};
@@ -40,6 +41,8 @@ pub struct Preview {
     problem: Problem,
     weights: Vec<f64>,
     poses: Vec<Pose>,
+    /// What odometry connects.
+    chains: Sets,
     settings: GlobalSettings,
 }
 
@@ -56,6 +59,7 @@ impl Preview {
                 fixed: submaps.iter().map(|submap| *submap == component.gauge).collect(),
             },
             poses: component.map_from_submap.values().copied().collect(),
+            chains: Sets::new(submaps.len()),
             submaps,
             index,
             weights: Vec::new(),
@@ -106,12 +110,16 @@ impl Preview {
         self.index.insert(submap.clone(), self.submaps.len());
         self.submaps.push(submap.clone());
         self.poses.push(pose);
+        self.chains.push();
         self.problem.nodes += 1;
         self.problem.fixed.push(false);
     }
 
     fn push(&mut self, edge: &Edge, weight: f64) {
         if let (Some(&from), Some(&to)) = (self.index.get(&edge.from), self.index.get(&edge.to)) {
+            if edge.kind == EdgeKind::Odometry {
+                self.chains.join(from, to);
+            }
             let (from_from_to, information) = (edge.from_from_to, edge.information);
             self.problem.constraints.push(Constraint { from, to, from_from_to, information });
             self.weights.push(weight);
@@ -126,7 +134,10 @@ impl Preview {
         let robust = &self.settings.robust;
         let weight = match edge.kind {
             EdgeKind::Odometry => 1.0,
-            EdgeKind::Loop => final_weight(robust.kernel, robust.squared_error_6dof, squared_error),
+            EdgeKind::Loop => {
+                let Constraint { from, to, .. } = self.problem.constraints[new];
+                final_weight(robust.kernel, robust.limit(self.chains.same(from, to)), squared_error)
+            }
         };
         self.weights[new] = weight;
         let (mut iterations, mut moved_m) = (0, 0.0f64);

@@ -1,6 +1,5 @@
 //! What a solve gives: components, each with a frame, poses, and what became of every loop.
 
-use crate::global::GlobalSettings;
 use crate::graph::{Cut, Edge, EdgeKey, EntryName, EntryProblem};
 use crate::relative::NotJoined;
 use coma_geometry::{AgentId, MapId, Pose, SubmapId};
@@ -60,20 +59,21 @@ pub struct LoopWeight {
 }
 
 impl LoopWeight {
-    /// Says what became of a loop; `contradicts` if it contradicts those that joined its chains.
+    /// Says what became of a loop; `contradicts` if it contradicts those that joined its chains; `limit` is the largest
+    /// squared error that is believed.
     pub(crate) fn judged(
         edge: &Edge,
         weight: f64,
         squared_error: f64,
         contradicts: bool,
-        settings: &GlobalSettings,
+        limit: f64,
     ) -> LoopWeight {
         let verdict = if weight >= 0.5 {
             LoopVerdict::Used
         } else if contradicts {
             LoopVerdict::Inconsistent
         } else {
-            LoopVerdict::LargeResidual { squared_error, limit: settings.robust.squared_error_6dof }
+            LoopVerdict::LargeResidual { squared_error, limit }
         };
         LoopWeight {
             key: edge.key.clone(),

@@ -19,12 +19,14 @@ mod parameters;
 mod project;
 mod reach;
 pub mod scene;
+mod seen;
 mod settings;
 mod sort;
 mod tiles;
 
 pub use backward::{Gradients, PixelGradients, SurfelGradients, backward};
 pub use forward::{Projection, Sorted, Tiled, render, render_only};
+pub use seen::seen;
 pub use settings::{GrowthTest, Outputs, RenderSettings};
 
 use coma_frame::Image;

@@ -38,6 +38,17 @@ impl SurfelCloud {
     /// Bytes that one surfel takes.
     pub const SURFEL_BYTES: usize = 13 * size_of::<f32>();
 
+    /// Empty, with room for `count`.
+    pub fn with_capacity(count: usize) -> Self {
+        SurfelCloud {
+            center_m: Vec::with_capacity(count),
+            rotation_wxyz: Vec::with_capacity(count),
+            scale_m: Vec::with_capacity(count),
+            opacity: Vec::with_capacity(count),
+            color: Vec::with_capacity(count),
+        }
+    }
+
     /// Number of surfels.
     pub fn len(&self) -> usize {
         self.center_m.len()

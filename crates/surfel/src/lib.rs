@@ -6,4 +6,4 @@ pub mod pack;
 pub mod ply;
 
 pub use cloud::{Surfel, SurfelCloud};
-pub use merge::{MergeSettings, Part, merge, merge_each};
+pub use merge::{Keepers, MergeSettings, Part, merge};

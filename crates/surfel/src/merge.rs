@@ -66,62 +66,100 @@ impl Share {
 /// One cloud in the map, submap by submap in the order given. Surfels that are not finite are left out.
 pub fn merge(parts: &[Part<'_>], settings: &MergeSettings) -> SurfelCloud {
     let part = |i: usize| Ok::<_, Infallible>((Cow::Borrowed(parts[i].surfels), parts[i].map_from_submap));
-    match merge_each(parts.len(), part, settings) {
-        Ok((map, _)) => map,
+    let keepers = match Keepers::in_rounds(1, parts.len(), part, settings) {
+        Ok(keepers) => keepers,
         Err(never) => match never {},
-    }
+    };
+    let kept = parts.iter().enumerate().flat_map(|(i, p)| keepers.kept(i, p.surfels, &p.map_from_submap));
+    kept.collect()
 }
 
-/// As [`merge`], of `count` submaps that need not be in memory together: `part` is asked for each, in order, for
-/// its surfels and `map_from_submap`; twice, and once more for every 64 submaps. Beside the map: how many surfels of each
-/// submap are kept.
-pub fn merge_each<'a, E>(
-    count: usize,
-    mut part: impl FnMut(usize) -> Result<(Cow<'a, SurfelCloud>, Pose), E>,
-    settings: &MergeSettings,
-) -> Result<(SurfelCloud, Vec<usize>), E> {
-    let face_m2 = (settings.cell_m * settings.cell_m) as f32;
-    let rounds = count.div_ceil(PARTS_AT_ONCE);
-    let mut keepers = Vec::new();
-    for round in 0..rounds {
-        let mut shares = Vec::new();
-        for i in 0..count {
-            let (surfels, map_from_submap) = part(i)?;
-            let mut of_part: HashMap<Cell, Share> = HashMap::new();
-            for surfel in placed(&surfels, &map_from_submap) {
-                let cell = cell(&surfel, settings.cell_m);
-                if column(&cell) % rounds != round {
-                    continue;
+/// What [`merge`] keeps of each submap, for submaps that need not be in memory together.
+pub struct Keepers {
+    /// The submap that keeps its surfels in a cube, sorted by cube; `None` if all do.
+    of_cell: Vec<(Cell, Option<u32>)>,
+    counts: Vec<usize>,
+    cell_m: f64,
+}
+
+impl Keepers {
+    /// Among `count` submaps: `part` is asked for each, in order, for its surfels and `map_from_submap`; once for every
+    /// 64 submaps.
+    pub fn among<'a, E>(
+        count: usize,
+        part: impl FnMut(usize) -> Result<(Cow<'a, SurfelCloud>, Pose), E>,
+        settings: &MergeSettings,
+    ) -> Result<Self, E> {
+        Self::in_rounds(count.div_ceil(PARTS_AT_ONCE), count, part, settings)
+    }
+
+    fn in_rounds<'a, E>(
+        rounds: usize,
+        count: usize,
+        mut part: impl FnMut(usize) -> Result<(Cow<'a, SurfelCloud>, Pose), E>,
+        settings: &MergeSettings,
+    ) -> Result<Self, E> {
+        let face_m2 = (settings.cell_m * settings.cell_m) as f32;
+        let mut out = Keepers { of_cell: Vec::new(), counts: vec![0; count], cell_m: settings.cell_m };
+        for round in 0..rounds {
+            let mut shares = Vec::new();
+            for i in 0..count {
+                let (surfels, map_from_submap) = part(i)?;
+                let mut of_part: HashMap<Cell, Share> = HashMap::new();
+                for surfel in placed(&surfels, &map_from_submap) {
+                    let cell = cell(&surfel, settings.cell_m);
+                    if column(&cell) % rounds != round {
+                        continue;
+                    }
+                    let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1];
+                    let shown_m2 = (disc_m2 * surfel.opacity).min(face_m2);
+                    let share = Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 };
+                    of_part.entry(cell).and_modify(|sum| sum.add(&share)).or_insert(share);
                 }
-                let disc_m2 = std::f32::consts::PI * surfel.scale_m[0] * surfel.scale_m[1];
-                let shown_m2 = (disc_m2 * surfel.opacity).min(face_m2);
-                let share = Share { part: i as u32, shown_m2, discs_m2: disc_m2, count: 1 };
-                of_part.entry(cell).and_modify(|sum| sum.add(&share)).or_insert(share);
+                shares.extend(of_part);
             }
-            shares.extend(of_part);
+            out.add(shares, face_m2, settings);
         }
-        keepers.extend(keepers_among(shares, face_m2, settings));
+        out.of_cell.sort_unstable_by_key(|(cell, _)| *cell);
+        Ok(out)
     }
-    keepers.sort_unstable_by_key(|(cell, _)| *cell);
-    let (mut out, mut kept) = (SurfelCloud::default(), vec![0; count]);
-    for i in 0..count {
-        let (surfels, map_from_submap) = part(i)?;
-        for surfel in placed(&surfels, &map_from_submap) {
-            let cell = cell(&surfel, settings.cell_m);
-            let keeper =
-                keepers.binary_search_by_key(&cell, |(cell, _)| *cell).ok().and_then(|at| keepers[at].1);
-            if keeper.is_none_or(|keeper| keeper == i as u32) {
-                out.push(surfel);
-                kept[i] += 1;
+
+    fn add(&mut self, mut shares: Vec<(Cell, Share)>, face_m2: f32, settings: &MergeSettings) {
+        shares.sort_unstable_by_key(|(cell, share)| (*cell, share.part));
+        for of_cell in shares.chunk_by(|a, b| a.0 == b.0) {
+            let cell = of_cell[0].0;
+            let keeper = keeper(&shares, cell, face_m2, settings);
+            for (_, share) in of_cell.iter().filter(|(_, s)| keeper.is_none_or(|keeper| keeper == s.part)) {
+                self.counts[share.part as usize] += share.count as usize;
             }
+            self.of_cell.push((cell, keeper));
         }
     }
-    Ok((out, kept))
+
+    /// How many surfels of each submap are kept.
+    pub fn counts(&self) -> &[usize] {
+        &self.counts
+    }
+
+    /// What is kept of a submap, in the map, in its order. `surfels` and `map_from_submap` must be those that
+    /// [`Keepers::among`] got for it.
+    pub fn kept<'a>(
+        &'a self,
+        part: usize,
+        surfels: &'a SurfelCloud,
+        map_from_submap: &'a Pose,
+    ) -> impl Iterator<Item = Surfel> + 'a {
+        placed(surfels, map_from_submap).filter(move |surfel| {
+            let cell = cell(surfel, self.cell_m);
+            let found = self.of_cell.binary_search_by_key(&cell, |(cell, _)| *cell);
+            found.ok().and_then(|at| self.of_cell[at].1).is_none_or(|keeper| keeper as usize == part)
+        })
+    }
 }
 
 /// Surfels in the map.
 fn placed<'a>(surfels: &'a SurfelCloud, map_from_submap: &'a Pose) -> impl Iterator<Item = Surfel> + 'a {
-    surfels.iter().filter(Surfel::is_finite).map(|surfel| surfel.moved(map_from_submap))
+    surfels.iter().map(|surfel| surfel.moved(map_from_submap)).filter(Surfel::is_finite)
 }
 
 /// A number that cubes before and behind a surface have in common: what decides on them lies together.
@@ -129,17 +167,6 @@ fn column((cube, side): &Cell) -> usize {
     let axis = *side as usize / 2;
     let across = [cube[(axis + 1) % 3], cube[(axis + 2) % 3]].map(|v| v as u32);
     (across[0].wrapping_mul(73_856_093) ^ across[1].wrapping_mul(19_349_663)) as usize
-}
-
-/// Which submap keeps its surfels in each cube, sorted by cube; `None` if none shows it.
-fn keepers_among(
-    mut shares: Vec<(Cell, Share)>,
-    face_m2: f32,
-    settings: &MergeSettings,
-) -> Vec<(Cell, Option<u32>)> {
-    shares.sort_unstable_by_key(|(cell, share)| (*cell, share.part));
-    let cells = shares.chunk_by(|a, b| a.0 == b.0);
-    cells.map(|of_cell| (of_cell[0].0, keeper(&shares, of_cell[0].0, face_m2, settings))).collect()
 }
 
 /// Which submap keeps its surfels in a cube; `None` if none shows it. `shares` are sorted by cube, then submap.
@@ -196,25 +223,31 @@ mod tests {
     #[test]
     fn what_a_submap_before_shows_as_well_is_dropped_and_what_is_new_is_kept() {
         let wall = wall(false);
-        let parts = [(0.0, 0.005), (0.5, 0.01)].map(|(x, z)| Pose::translation(x, 0.0, z));
-        let part = |i: usize| Ok::<_, Infallible>((Cow::Borrowed(&wall), parts[i]));
-        let (merged, kept) = merge_each(2, part, &MergeSettings::default()).unwrap();
-        assert_eq!(kept, [wall.len(), merged.len() - wall.len()]);
+        let merged = merge(&[at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)], &MergeSettings::default());
         // The second wall adds its right half.
         assert!((14_800..=15_200).contains(&merged.len()), "{}", merged.len());
         let alone = merge(&[at(&wall, 0.0, 0.005)], &MergeSettings::default());
         assert_eq!(alone.len(), wall.len(), "a submap never drops its own");
-        let together = merge(&[at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)], &MergeSettings::default());
-        assert_eq!(together, merged);
     }
 
     #[test]
-    fn many_submaps_merge_as_few_do() {
+    fn submaps_one_after_the_other_merge_as_they_do_together() {
         let wall = wall(false);
-        let two = [at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)];
-        let mut many = two.to_vec();
-        many.resize(2 * PARTS_AT_ONCE + 3, two[0]);
-        assert_eq!(merge(&many, &MergeSettings::default()), merge(&two, &MergeSettings::default()));
+        let mut parts = vec![at(&wall, 0.0, 0.005), at(&wall, 0.5, 0.01)];
+        parts.resize(2 * PARTS_AT_ONCE + 3, parts[0]);
+        let part = |i: usize| Ok::<_, Infallible>((Cow::Borrowed(&wall), parts[i].map_from_submap));
+        let keepers = Keepers::among(parts.len(), part, &MergeSettings::default()).unwrap();
+        let kept = |i: usize| -> SurfelCloud { keepers.kept(i, &wall, &parts[i].map_from_submap).collect() };
+        for i in 0..parts.len() {
+            assert_eq!(kept(i).len(), keepers.counts()[i], "{i}");
+        }
+        let together = merge(&parts, &MergeSettings::default());
+        assert_eq!(
+            (0..parts.len()).flat_map(|i| kept(i).iter().collect::<Vec<_>>()).collect::<SurfelCloud>(),
+            together
+        );
+        assert_eq!(together, merge(&parts[..2], &MergeSettings::default()));
+        assert_eq!(keepers.counts()[..2], [wall.len(), together.len() - wall.len()]);
     }
 
     #[test]

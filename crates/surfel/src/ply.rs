@@ -6,7 +6,7 @@
 
 use crate::{Surfel, SurfelCloud};
 use std::collections::HashMap;
-use std::fmt::Write;
+use std::io::{self, BufRead, ErrorKind, Read, Write};
 
 /// Names of the properties that are written, in order.
 pub const PROPERTIES: [&str; 17] = [
@@ -16,15 +16,18 @@ pub const PROPERTIES: [&str; 17] = [
 /// The third scale: a disc has no thickness, and viewers take logarithms.
 pub const NORMAL_SCALE_M: f32 = 1e-6;
 /// Bytes of a header that are looked at.
-const MAX_HEADER_BYTES: usize = 64 << 10;
+const MAX_HEADER_BYTES: u64 = 64 << 10;
 /// The constant of the zeroth spherical harmonic, 1 / (2 sqrt(pi)).
 const SH_C0: f32 = 0.282_094_8;
 /// Opacity is kept this far from 0 and 1, where its logit is infinite.
 const OPACITY_MARGIN: f32 = 1e-6;
 
 /// Why bytes are no such file; names the part.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, thiserror::Error)]
 pub enum PlyError {
+    /// They could not be read.
+    #[error(transparent)]
+    Io(#[from] io::Error),
     /// The header, with its line.
     #[error("header, line {line}: {message}")]
     Header {
@@ -48,12 +51,12 @@ pub enum PlyError {
         max: usize,
     },
     /// Cut off.
-    #[error("body: {found} bytes, {needed} are needed")]
+    #[error("body: ends within vertex {index} of {count}")]
     Length {
-        /// Bytes after the header.
-        found: usize,
-        /// Bytes of all vertices.
-        needed: usize,
+        /// Counted from 0.
+        index: usize,
+        /// What the header says.
+        count: usize,
     },
     /// A vertex that is no surfel.
     #[error("vertex {index}: a value is not finite, or its rotation is zero")]
@@ -64,29 +67,60 @@ pub enum PlyError {
 }
 
 /// Writes surfels. Those with a value that is not finite are left out: viewers choke on them.
-pub fn write(surfels: &SurfelCloud) -> Vec<u8> {
+pub fn write(surfels: &SurfelCloud, out: impl Write) -> io::Result<()> {
     let finite = || surfels.iter().filter(Surfel::is_finite);
-    let count = finite().count();
-    let mut header = String::from("ply\nformat binary_little_endian 1.0\ncomment CoMA surfels\n");
-    let _ = writeln!(header, "element vertex {count}");
-    for name in PROPERTIES {
-        let _ = writeln!(header, "property float {name}");
+    let mut writer = Writer::new(out, finite().count())?;
+    finite().try_for_each(|surfel| writer.push(&surfel))?;
+    writer.finish()
+}
+
+/// As [`write`], in memory.
+pub fn to_bytes(surfels: &SurfelCloud) -> Vec<u8> {
+    let mut out = Vec::with_capacity(1024 + surfels.len() * PROPERTIES.len() * 4);
+    match write(surfels, &mut out) {
+        Ok(()) => out,
+        Err(_) => unreachable!("a vector takes all bytes"),
     }
-    header.push_str("end_header\n");
-    let mut out = header.into_bytes();
-    out.reserve_exact(count * PROPERTIES.len() * 4);
-    for surfel in finite() {
-        for value in values(&surfel) {
-            out.extend_from_slice(&value.to_le_bytes());
+}
+
+/// Writes surfels one after the other.
+pub struct Writer<W> {
+    out: W,
+    missing: usize,
+}
+
+impl<W: Write> Writer<W> {
+    /// A file of `count` surfels. Many small pieces are written: a file wants a buffer around it.
+    pub fn new(mut out: W, count: usize) -> io::Result<Self> {
+        write!(out, "ply\nformat binary_little_endian 1.0\ncomment CoMA surfels\nelement vertex {count}\n")?;
+        for name in PROPERTIES {
+            writeln!(out, "property float {name}")?;
         }
+        writeln!(out, "end_header")?;
+        Ok(Writer { out, missing: count })
     }
-    out
+
+    /// Writes one with finite values; fails after the last.
+    pub fn push(&mut self, surfel: &Surfel) -> io::Result<()> {
+        let missing = self.missing.checked_sub(1);
+        self.missing = missing.ok_or_else(|| io::Error::other("more surfels than the header says"))?;
+        values(surfel).iter().try_for_each(|value| self.out.write_all(&value.to_le_bytes()))
+    }
+
+    /// Flushes; fails when some are missing.
+    pub fn finish(mut self) -> io::Result<()> {
+        if self.missing > 0 {
+            return Err(io::Error::other(format!("{} surfels fewer than the header says", self.missing)));
+        }
+        self.out.flush()
+    }
 }
 
 /// Reads at most `max_surfels` from a binary little-endian file with at least the properties that are written
-/// (normals aside), in any order and among others. The third scale is dropped.
-pub fn read(bytes: &[u8], max_surfels: usize) -> Result<SurfelCloud, PlyError> {
-    let header = read_header(bytes)?;
+/// (normals aside), in any order and among others. The third scale is dropped. Memory is taken for as many as the header
+/// says.
+pub fn read(mut input: impl BufRead, max_surfels: usize) -> Result<SurfelCloud, PlyError> {
+    let header = read_header(&mut input)?;
     if header.count > max_surfels {
         return Err(PlyError::TooMany { count: header.count, max: max_surfels });
     }
@@ -96,13 +130,13 @@ pub fn read(bytes: &[u8], max_surfels: usize) -> Result<SurfelCloud, PlyError> {
     let scale = [at("scale_0")?, at("scale_1")?];
     let opacity = at("opacity")?;
     let rotation = [at("rot_0")?, at("rot_1")?, at("rot_2")?, at("rot_3")?];
-    let body = &bytes[header.body..];
-    let needed = header.count.saturating_mul(header.stride);
-    if body.len() < needed {
-        return Err(PlyError::Length { found: body.len(), needed });
-    }
-    let mut out = SurfelCloud::default();
-    for (index, vertex) in body.chunks_exact(header.stride).take(header.count).enumerate() {
+    let mut vertex = vec![0; header.stride];
+    let mut out = SurfelCloud::with_capacity(header.count);
+    for index in 0..header.count {
+        input.read_exact(&mut vertex).map_err(|e| match e.kind() {
+            ErrorKind::UnexpectedEof => PlyError::Length { index, count: header.count },
+            _ => PlyError::Io(e),
+        })?;
         let float =
             |at: usize| f32::from_le_bytes([vertex[at], vertex[at + 1], vertex[at + 2], vertex[at + 3]]);
         let quaternion = rotation.map(float);
@@ -139,22 +173,23 @@ struct Header {
     stride: usize,
     /// Offsets of float properties within a vertex.
     floats: HashMap<String, usize>,
-    /// Where the body begins.
-    body: usize,
 }
 
-fn read_header(bytes: &[u8]) -> Result<Header, PlyError> {
-    let head = &bytes[..bytes.len().min(MAX_HEADER_BYTES)];
-    let mut header = Header { count: 0, stride: 0, floats: HashMap::new(), body: 0 };
+fn read_header(input: &mut impl BufRead) -> Result<Header, PlyError> {
+    let mut head = input.take(MAX_HEADER_BYTES);
+    let mut header = Header { count: 0, stride: 0, floats: HashMap::new() };
     let mut elements = 0;
     let mut formatted = false;
     let mut line = 0;
-    while let Some(length) = head[header.body..].iter().position(|b| *b == b'\n') {
+    loop {
         line += 1;
         let refuse = |message: &str| PlyError::Header { line, message: message.into() };
-        let text = std::str::from_utf8(&head[header.body..header.body + length])
-            .map_err(|_| refuse("is no text"))?;
-        header.body += length + 1;
+        let mut bytes = Vec::new();
+        head.read_until(b'\n', &mut bytes)?;
+        if bytes.pop() != Some(b'\n') {
+            return Err(refuse("no end_header"));
+        }
+        let text = std::str::from_utf8(&bytes).map_err(|_| refuse("is no text"))?;
         let words: Vec<&str> = text.split_ascii_whitespace().collect();
         match words[..] {
             ["ply"] if line == 1 => {}
@@ -188,7 +223,6 @@ fn read_header(bytes: &[u8]) -> Result<Header, PlyError> {
             _ => return Err(refuse("is not understood")),
         }
     }
-    Err(PlyError::Header { line: line + 1, message: "no end_header".into() })
 }
 
 #[cfg(test)]
@@ -209,7 +243,7 @@ mod tests {
 
     #[test]
     fn surfels_come_back() {
-        let after = read(&write(&cloud()), 2).unwrap();
+        let after = read(&to_bytes(&cloud())[..], 2).unwrap();
         for (a, b) in cloud().iter().zip(after.iter()) {
             assert_eq!(a.center_m, b.center_m);
             let close = |x: &[f32], y: &[f32]| x.iter().zip(y).all(|(x, y)| (x - y).abs() < 2e-6);
@@ -223,7 +257,7 @@ mod tests {
 
     #[test]
     fn the_layout_is_that_of_3d_gaussian_splatting_with_a_flat_third_scale() {
-        let bytes = write(&cloud());
+        let bytes = to_bytes(&cloud());
         let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
         let header = std::str::from_utf8(&bytes[..end]).unwrap();
         assert!(header.starts_with("ply\nformat binary_little_endian 1.0\n"), "{header}");
@@ -250,37 +284,49 @@ mod tests {
             body.extend_from_slice(&value.to_le_bytes());
         }
         header.push_str("element face 0\nproperty list uchar int vertex_indices\nend_header\n");
-        let read = read(&[header.as_bytes(), &body].concat(), 1).unwrap();
+        let read = read(&[header.as_bytes(), &body].concat()[..], 1).unwrap();
         assert_eq!(read.rotation_wxyz, [[1.0, 0.0, 0.0, 0.0]]);
         assert_eq!((read.opacity[0], read.color[0], read.scale_m[0]), (0.5, [0.5; 3], [1.0; 2]));
     }
 
     #[test]
     fn what_is_no_such_file_is_refused_by_name() {
-        let bytes = write(&cloud());
+        let bytes = to_bytes(&cloud());
         for end in 0..bytes.len() {
             assert!(read(&bytes[..end], 2).is_err(), "{end}");
         }
-        assert_eq!(read(&bytes, 1), Err(PlyError::TooMany { count: 2, max: 1 }));
+        assert!(matches!(read(&bytes[..], 1), Err(PlyError::TooMany { count: 2, max: 1 })));
+        assert!(matches!(read(&bytes[..bytes.len() - 1], 2), Err(PlyError::Length { index: 1, count: 2 })));
         let with = |from: &str, to: &str| {
             let text: Vec<u8> = bytes.clone();
             let at = text.windows(from.len()).position(|w| w == from.as_bytes()).unwrap();
             let changed = [&text[..at], to.as_bytes(), &text[at + from.len()..]].concat();
-            read(&changed, 2).unwrap_err()
+            read(&changed[..], 2).unwrap_err()
         };
-        assert_eq!(with("float opacity", "float opacitx"), PlyError::Property { name: "opacity" });
+        assert!(matches!(with("float opacity", "float opacitx"), PlyError::Property { name: "opacity" }));
         assert!(matches!(with("binary_little", "binary_big123"), PlyError::Header { line: 2, .. }));
         assert!(matches!(with("vertex 2", "vertex -"), PlyError::Header { line: 4, .. }));
         let mut bad = bytes.clone();
         let end = bad.len();
         bad[end - 4..].copy_from_slice(&f32::NAN.to_le_bytes());
-        assert_eq!(read(&bad, 2), Err(PlyError::Vertex { index: 1 }));
+        assert!(matches!(read(&bad[..], 2), Err(PlyError::Vertex { index: 1 })));
     }
 
     #[test]
     fn surfels_that_are_not_finite_are_left_out() {
         let mut surfels = cloud();
         surfels.scale_m[0][1] = f32::NAN;
-        assert_eq!(read(&write(&surfels), 2).unwrap().len(), 1);
+        assert_eq!(read(&to_bytes(&surfels)[..], 2).unwrap().len(), 1);
+    }
+
+    #[test]
+    fn a_writer_takes_as_many_as_its_header_says() {
+        let mut bytes = Vec::new();
+        let mut writer = Writer::new(&mut bytes, 1).unwrap();
+        writer.push(&cloud().get(0)).unwrap();
+        assert!(writer.push(&cloud().get(1)).unwrap_err().to_string().contains("more surfels"));
+        writer.finish().unwrap();
+        assert_eq!(read(&bytes[..], 1).unwrap().len(), 1);
+        assert!(Writer::new(Vec::new(), 1).unwrap().finish().is_err());
     }
 }

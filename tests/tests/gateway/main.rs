@@ -136,7 +136,7 @@ async fn submaps_lie_in_one_map_and_their_surfels_are_there(http: &Http) {
             assert_eq!(json!(surfels.len()), submap["surfels"], "{id}");
         }
         let ply = http.get(&format!("/api/v1/submaps/{id}/surfels?format=ply")).await.bytes().await.unwrap();
-        assert_eq!(json!(coma_surfel::ply::read(&ply, 10_000_000).unwrap().len()), submap["surfels"]);
+        assert_eq!(json!(coma_surfel::ply::read(&ply[..], 10_000_000).unwrap().len()), submap["surfels"]);
         let known = reqwest::Client::new()
             .get(format!("{}{path}", http.0))
             .header("if-none-match", format!("\"{revision}\""));
@@ -155,7 +155,7 @@ async fn the_merged_map_is_smaller_than_its_parts(http: &Http) {
     let response = http.get("/api/v1/map.ply").await;
     assert_eq!(response.headers()["x-coma-map"], map["id"].as_str().unwrap());
     let ply = response.bytes().await.unwrap();
-    let merged = coma_surfel::ply::read(&ply, 10_000_000).unwrap();
+    let merged = coma_surfel::ply::read(&ply[..], 10_000_000).unwrap();
     let parts = map["surfels"].as_u64().unwrap() as usize;
     // Both agents saw the same stretch: much of it is dropped, but not nearly all.
     assert!(merged.len() < parts * 9 / 10 && merged.len() > parts / 5, "{} of {parts}", merged.len());

@@ -172,6 +172,8 @@ impl OwnBlock {
     pub fn loop_weight(&self, index: u32, weight: f64, squared_error: f64) -> Option<LoopWeight> {
         let edge = self.edges.get(index as usize).filter(|e| e.kind == crate::EdgeKind::Loop)?;
         let contradicts = self.contradicting.contains(&edge.key);
-        Some(LoopWeight::judged(edge, weight, squared_error, contradicts, &self.settings))
+        // Blocks believe no loop more than others.
+        let limit = self.settings.robust.limit(false);
+        Some(LoopWeight::judged(edge, weight, squared_error, contradicts, limit))
     }
 }

@@ -36,10 +36,11 @@ impl Viewer for ViewerService {
     ) -> Result<Response<Self::GetTrajectoryStream>, Status> {
         let first = request.get_ref().first_sequence;
         let knowledge = self.0.lock();
-        let poses = knowledge.trajectory.iter().filter(|p| p.pose.sequence >= first);
-        let poses: Vec<v1::PoseEstimate> = poses.map(|p| convert::pose_estimate(&knowledge, p)).collect();
-        let messages = poses.chunks(POSES).map(|c| v1::GetTrajectoryResponse { poses: c.to_vec() }).collect();
-        Ok(Response::new(answers(messages)))
+        let poses: Vec<_> = knowledge.trajectory.iter().filter(|p| p.pose.sequence >= first).collect();
+        let message = |poses: &[&_]| v1::GetTrajectoryResponse {
+            poses: poses.iter().map(|p| convert::pose_estimate(&knowledge, p)).collect(),
+        };
+        Ok(Response::new(answers(poses.chunks(POSES).map(message).collect())))
     }
 
     async fn list_submaps(

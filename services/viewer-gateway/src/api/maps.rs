@@ -86,7 +86,7 @@ pub async fn ply(
         let parts: Vec<_> = placed.iter().map(part).collect();
         let parts: Vec<Part<'_>> =
             parts.iter().map(|(pose, surfels)| Part { surfels, map_from_submap: *pose }).collect();
-        Ok(Bytes::from(coma_surfel::ply::write(&merge(&parts, &MergeSettings::default()))))
+        Ok(Bytes::from(coma_surfel::ply::to_bytes(&merge(&parts, &MergeSettings::default()))))
     };
     let file = gateway.heavy(write).await?;
     let headers = [

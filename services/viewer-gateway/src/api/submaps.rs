@@ -115,7 +115,7 @@ pub async fn surfels(
             let write = move || {
                 let unpacked =
                     surfels.surfels(max_surfels).map_err(|e| ApiError::agent(format!("surfels: {e}")))?;
-                Ok(Bytes::from(coma_surfel::ply::write(&unpacked)))
+                Ok(Bytes::from(coma_surfel::ply::to_bytes(&unpacked)))
             };
             out.insert(
                 header::CONTENT_DISPOSITION,
