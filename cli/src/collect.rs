@@ -1,7 +1,7 @@
 //! What agents have at the end of a run, fetched over gRPC as any client could.
 
 use crate::stream::plain;
-use anyhow::{Context, bail, ensure};
+use anyhow::{Context, bail};
 use coma_geometry::{Pose, StampNs, SubmapId};
 use coma_runtime::{ByteLedger, Channel, Class, ClientSettings, channel};
 use coma_surfel::{SurfelCloud, pack};
@@ -82,15 +82,9 @@ impl AgentCalls {
                 continue;
             };
             let request = v1::GetSubmapRequest { id: info.id };
-            let mut stream = self.viewer.get_submap(request).await.map_err(plain)?.into_inner();
-            let mut packed = Vec::new();
-            while let Some(message) = stream.message().await.map_err(plain)? {
-                ensure!(
-                    packed.len() + message.chunk.len() <= MAX_PACKED_BYTES,
-                    "submap {id}: more than {MAX_PACKED_BYTES} bytes"
-                );
-                packed.extend_from_slice(&message.chunk);
-            }
+            let stream = self.viewer.get_submap(request).await.map_err(plain)?.into_inner();
+            let (_, packed) =
+                coma_wire::packed_surfels(stream, &id, MAX_PACKED_BYTES).await.map_err(plain)?;
             let count = pack::count(&packed, MAX_SURFELS).with_context(|| format!("submap {id}"))?;
             let bytes = spool.put(&packed)?;
             out.push(Submap { id, map_from_submap, count, bytes, spool: spool.clone() });

@@ -90,7 +90,7 @@ pub struct Writer<W> {
 }
 
 impl<W: Write> Writer<W> {
-    /// A file of `count` surfels. Many small pieces are written: a file wants a buffer around it.
+    /// A file of `count` surfels, each written on its own: a file wants a buffer around it.
     pub fn new(mut out: W, count: usize) -> io::Result<Self> {
         write!(out, "ply\nformat binary_little_endian 1.0\ncomment CoMA surfels\nelement vertex {count}\n")?;
         for name in PROPERTIES {
@@ -104,7 +104,7 @@ impl<W: Write> Writer<W> {
     pub fn push(&mut self, surfel: &Surfel) -> io::Result<()> {
         let missing = self.missing.checked_sub(1);
         self.missing = missing.ok_or_else(|| io::Error::other("more surfels than the header says"))?;
-        values(surfel).iter().try_for_each(|value| self.out.write_all(&value.to_le_bytes()))
+        self.out.write_all(values(surfel).map(f32::to_le_bytes).as_flattened())
     }
 
     /// Flushes; fails when some are missing.

@@ -17,6 +17,7 @@ mod limited;
 mod log;
 mod payload;
 mod place;
+mod submap;
 
 pub use camera::Calibration;
 pub use evidence::{EvidenceBlob, decode_evidence, encode_evidence};
@@ -28,6 +29,7 @@ pub use limited::Limited;
 pub use log::{entry_from_bytes, entry_to_bytes, hash, version_vector};
 pub use payload::{decode_payload, encode_payload};
 pub use prost::Message;
+pub use submap::packed_surfels;
 
 /// The words of the log that conversions give, for services that know agents by their messages alone.
 pub mod entries {

@@ -34,8 +34,8 @@ export class State {
   /** Submaps that were asked for alone: others stay as they are. An answer that is older than the list of all has no say. */
   addSubmaps(submaps) {
     for (const submap of submaps) {
-      const closed = this.submaps.get(submap.id)?.closed && !submap.closed;
-      if (!closed) this.submaps.set(submap.id, submap);
+      const isOlder = this.submaps.get(submap.id)?.closed && !submap.closed;
+      if (!isOlder) this.submaps.set(submap.id, submap);
     }
   }
 

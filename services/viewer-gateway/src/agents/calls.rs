@@ -4,7 +4,6 @@ use super::link::{Link, plain};
 use crate::cache::CachedSurfels;
 use crate::error::ApiError;
 use crate::json::{self, FramePose, Unreachable};
-use bytes::BytesMut;
 use coma_geometry::{AgentId, MapId, Pose, SubmapId};
 use coma_wire::{At, FieldError, Wire, v1};
 use futures::{StreamExt, stream};
@@ -114,19 +113,9 @@ impl Link {
         let limit = coma_surfel::pack::packed_bytes(max_surfels);
         let call = async {
             let request = v1::GetSubmapRequest { id: Some(id.to_wire()) };
-            let mut stream = self.viewer().get_submap(request).await?.into_inner();
-            let mut packed = BytesMut::new();
-            let mut revision = 0;
-            while let Some(message) = stream.message().await? {
-                if packed.len() + message.chunk.len() > limit {
-                    return Err(Status::resource_exhausted(format!(
-                        "submap {id} has more than {max_surfels} surfels"
-                    )));
-                }
-                packed.extend_from_slice(&message.chunk);
-                revision = message.revision;
-            }
-            Ok(CachedSurfels::new(revision, packed.freeze()))
+            let stream = self.viewer().get_submap(request).await?.into_inner();
+            let (revision, packed) = coma_wire::packed_surfels(stream, id, limit).await?;
+            Ok(CachedSurfels::new(revision, packed))
         };
         self.in_time(call).await
     }
